@@ -79,11 +79,11 @@ class Depth(_Result):
     state: NDArray[np.uint8]
     """uint8: 0 matched, 1 occluded, 2 mismatched, 3 out of view; all but 0 are filled from their surroundings."""
     disparity_deviation: NDArray[np.float32]
-    """float32, px: standard deviation, NaN where filled."""
+    """float32, px: standard deviation, NaN where unknown."""
     depth: NDArray[np.float32] | None
     """float32, in the unit of the baseline."""
     depth_deviation: NDArray[np.float32] | None
-    """float32: standard deviation, NaN where filled."""
+    """float32: standard deviation, NaN where unknown."""
     confidence: NDArray[np.float32] | None
     """float32, 0 to 1; with ``confidence=True``."""
     Q: NDArray[np.float64] | None

@@ -83,7 +83,7 @@ pub struct DepthResult {
     pub depth: Option<GrayF32>,
     /// Confidence of each disparity, 0 to 1, 0 where filled; `None` without [`StereoOptions::confidence`].
     pub confidence: Option<GrayF32>,
-    /// Standard deviation of each disparity in px, NaN where filled.
+    /// Standard deviation of each disparity in px, of filled ones by how far their surface was extrapolated; NaN where unknown.
     pub sigma: GrayF32,
     /// Smallest disparity searched, in px, and number of disparities.
     pub disparities: (i32, usize),
@@ -113,8 +113,8 @@ impl DepthResult {
         Some(self.geometry?.cloud(self.depth.as_ref()?.view(), left))
     }
 
-    /// Returns the standard deviation of each depth in the unit of the baseline, to first order, NaN where filled or
-    /// unknown; `None` without a geometry.
+    /// Returns the standard deviation of each depth in the unit of the baseline, to first order, NaN where unknown; `None`
+    /// without a geometry.
     pub fn depth_sigma(&self) -> Option<GrayF32> {
         let (geometry, depth) = (self.geometry?, self.depth.as_ref()?);
         Some(GrayF32::from_fn(depth.width(), depth.height(), |x, y| {

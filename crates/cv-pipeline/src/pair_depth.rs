@@ -97,7 +97,7 @@ pub(crate) fn pair_depth(
         // A winner at an end of the range is nearest to a disparity beyond it.
         let d = d - scene.disparities.0 as f32;
         let is_within = d >= 1.0 && d <= scene.disparities.1 as f32 - 2.0;
-        // Filled disparities have no standard deviation.
+        // Filled pixels are selected by `fill`, not by their standard deviation.
         let sigma = geometry.depth_uncertainty(depth, sigma.at(x, y)[0]);
         let is_certain = !matched || sigma <= options.max_deviation * depth;
         let is_valid = depth.is_finite() && is_within && is_certain && (matched || options.fill);

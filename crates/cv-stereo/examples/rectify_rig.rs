@@ -1,4 +1,4 @@
-//! Rectifies the photographs of a rig whose cameras are turned and whose lenses distort.
+//! Rectifies the images of a rig with rotated cameras and lens distortion.
 use cv_core::{Camera, Distortion, Pose, Rotation3, Silent, StereoRig, Vector3};
 use cv_stereo::{Rectification, RectifyOptions};
 use cv_synth::{RenderOptions, Scene, render};

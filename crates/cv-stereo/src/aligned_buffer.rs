@@ -1,6 +1,6 @@
 //! Buffers that start on a cache line.
 
-/// A reusable buffer of `T` whose first element lies on a cache line.
+/// A reusable buffer of `T` that starts at a cache line.
 #[derive(Debug, Default)]
 pub(crate) struct AlignedBuffer<T> {
     data: Vec<T>,
@@ -11,11 +11,11 @@ pub(crate) struct AlignedBuffer<T> {
 const LINE: usize = 64;
 
 impl<T: Copy> AlignedBuffer<T> {
-    /// Makes the buffer `len` long. What it holds is unspecified where it was used before, else `fill`.
+    /// Resizes the buffer to `len` elements: `fill`, or, if the buffer was used before, unspecified values.
     pub(crate) fn resize(&mut self, len: usize, fill: T) {
         let needed = len + LINE / size_of::<T>();
         if self.data.len() < needed {
-            // Never copies: the old contents are of no use.
+            // Without a copy of the old elements.
             self.data = vec![fill; needed];
         }
         self.start = self.data.as_ptr().align_offset(LINE).min(needed - len);

@@ -1,5 +1,5 @@
-//! The census transform (Zabih & Woodfill, ECCV 1994): what a pixel's neighborhood looks like, in bits that no
-//! change of exposure touches.
+//! The census transform (Zabih & Woodfill, ECCV 1994): a bit string of comparisons with the neighbors, invariant to monotonic changes of
+//! intensity.
 
 use crate::layout::Layout;
 use crate::{Census, IntensityCost};
@@ -7,10 +7,10 @@ use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
 
-/// Columns by which a row of gray values is continued on both sides: the largest radius of a window.
+/// Columns by which rows of gray levels are extended on both sides: the largest radius of a window.
 pub(crate) const MARGIN: usize = 4;
 
-/// Gray values 0 to 65535, each row continued by [`MARGIN`] copies of its first and last value.
+/// Gray levels 0 to 65535, each row extended by [`MARGIN`] copies of its first and last value.
 #[derive(Debug, Default)]
 pub(crate) struct Gray {
     pub(crate) values: Vec<u16>,
@@ -23,8 +23,8 @@ impl Gray {
         self.width + 2 * MARGIN
     }
 
-    /// Gray levels 0 to 255 without margins into `out` (resized): the upper eight bits of every value, but where all lie within a quarter of the
-    /// scale, as those of some sensors of 12 bits do: then as far as they lie between the least and the greatest.
+    /// Converts to gray levels 0 to 255 without margins into `out` (resized): the upper eight bits of every value; if all are within a quarter
+    /// of the scale, as from some sensors of 12 bits, stretched from minimum to maximum.
     pub(crate) fn to_bytes(&self, out: &mut Vec<u8>) {
         out.resize(self.width * self.height, 0);
         let ends = |row: &[u16]| row.iter().fold((u16::MAX, 0), |(low, high), &v| (low.min(v), high.max(v)));
@@ -39,7 +39,7 @@ impl Gray {
         });
     }
 
-    /// Half the size of `from`, each pixel the mean of four; a last odd row or column is left out.
+    /// Downsamples `from` to half resolution, each pixel the mean of four; a last odd row or column is left out.
     pub(crate) fn halve(&mut self, from: &Self) {
         (self.width, self.height) = (from.width / 2, from.height / 2);
         let (stride, from_stride, width) = (self.stride(), from.stride(), self.width);
@@ -56,20 +56,20 @@ impl Gray {
         });
     }
 
-    /// Row `y` with its margins; beyond the top and bottom the first and last row.
+    /// Returns row `y` with its margins; the first or last row outside the image.
     fn row(&self, y: isize) -> &[u16] {
         let y = y.clamp(0, self.height as isize - 1) as usize;
         &self.values[y * self.stride()..][..self.stride()]
     }
 }
 
-/// Number of bytes that describe a pixel: its census bits, and what the intensity_cost compares.
+/// Returns the number of bytes that describe a pixel: its census bits, and the value of the intensity cost.
 pub(crate) fn planes(window: Census, intensity_cost: IntensityCost) -> usize {
     window.bits().div_ceil(8) + usize::from(intensity_cost != IntensityCost::None)
 }
 
-/// Describes every pixel, into `out` (resized): the bytes of a row one after the other. Bit `i` of the census tells
-/// whether the `i`-th neighbor, row by row, is darker than the center.
+/// Describes every pixel, into `out` (resized), each row plane by plane. Bit `i` of the census is set if the `i`-th neighbor, in raster
+/// order, is darker than the center.
 pub(crate) fn describe(level: Level, gray: &Gray, window: Census, intensity_cost: IntensityCost, out: &mut Vec<u8>) {
     let stride = gray.width * planes(window, intensity_cost);
     out.resize(stride * gray.height, 0);
@@ -78,8 +78,8 @@ pub(crate) fn describe(level: Level, gray: &Gray, window: Census, intensity_cost
         .for_each(|(y, row)| describe_row(level, gray, window, intensity_cost, y, row));
 }
 
-/// As [`describe`], each row mirrored and dealt out to the phases of `layout`: element `j` is column
-/// `width − 1 − min_disparity − j`, zero outside the image.
+/// As [`describe`], each row mirrored and split into the phases of `layout`: element `j` is column `width − 1 − min_disparity − j`, zero
+/// outside the image.
 pub(crate) fn describe_mirrored(
     level: Level,
     gray: &Gray,
@@ -91,7 +91,7 @@ pub(crate) fn describe_mirrored(
 ) {
     let (width, planes) = (gray.width, planes(window, intensity_cost));
     let (n, phase, len) = (layout.vectors(), layout.phase(width), layout.right_row(width));
-    // Element of the last column, and where it would be were the row long enough on both sides.
+    // Element of the last column, possibly outside the row, and the elements inside the image.
     let first = -min_disparity;
     let inside = first.clamp(0, len as i64) as usize..(first + width as i64).clamp(0, len as i64) as usize;
     // One past the column of the first element inside.
@@ -109,9 +109,9 @@ pub(crate) fn describe_mirrored(
                     let to = &mut row[(of * planes + p) * phase..][..phase];
                     match n {
                         1 => to.copy_from_slice(&mirrored[..phase]),
-                        2 => every(&mirrored[of..], to, |v| u16::from_le_bytes(v) as u8),
-                        4 => every(&mirrored[of..], to, |v| u32::from_le_bytes(v) as u8),
-                        _ => every(&mirrored[of..], to, |v| u64::from_le_bytes(v) as u8),
+                        2 => copy_every(&mirrored[of..], to, |v| u16::from_le_bytes(v) as u8),
+                        4 => copy_every(&mirrored[of..], to, |v| u32::from_le_bytes(v) as u8),
+                        _ => copy_every(&mirrored[of..], to, |v| u64::from_le_bytes(v) as u8),
                     }
                 }
             }
@@ -119,14 +119,14 @@ pub(crate) fn describe_mirrored(
     );
 }
 
-/// Every `N`-th element from the first on. To narrow integers is something that compilers have instructions for.
-fn every<const N: usize>(from: &[u8], to: &mut [u8], first: impl Fn([u8; N]) -> u8) {
+/// Copies every `N`-th element from the first on, as a narrowing of integers, for which compilers have instructions.
+fn copy_every<const N: usize>(from: &[u8], to: &mut [u8], first: impl Fn([u8; N]) -> u8) {
     for (to, from) in to.iter_mut().zip(from.as_chunks::<N>().0) {
         *to = first(*from);
     }
 }
 
-/// The bytes of row `y`, one after the other.
+/// Describes row `y`, plane by plane.
 fn describe_row(level: Level, gray: &Gray, window: Census, intensity_cost: IntensityCost, y: usize, out: &mut [u8]) {
     let bytes = planes(window, IntensityCost::None);
     for (plane, row) in out.chunks_exact_mut(gray.width).enumerate() {
@@ -162,7 +162,7 @@ fn intensity_row<S: Simd>(_: S, gray: &Gray, intensity_cost: IntensityCost, y: u
     }
 }
 
-/// The neighbors of bits `8·plane` to `8·plane + 7`, of every pixel of row `y`.
+/// Computes census bits `8·plane` to `8·plane + 7` of every pixel of row `y`.
 #[simd]
 fn census_row<S: Simd>(_: S, gray: &Gray, window: Census, plane: usize, y: usize, out: &mut [u8]) {
     let (w, h) = window.size();
@@ -174,7 +174,7 @@ fn census_row<S: Simd>(_: S, gray: &Gray, window: Census, plane: usize, y: usize
         if index >= window.bits() {
             break;
         }
-        // The center itself, at index bits / 2, has no bit.
+        // The center, at index bits / 2, has no bit.
         let at = index + usize::from(index >= window.bits() / 2);
         let (dx, dy) = (at % w, at / w);
         let row = gray.row(y as isize + dy as isize - ry as isize);

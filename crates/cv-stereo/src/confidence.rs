@@ -1,9 +1,9 @@
-//! How sure a disparity is.
+//! Confidence and standard deviation of matched disparities.
 
 use crate::PixelState;
 use crate::winner::{NO_SUM, Winner};
 
-/// Confidence of a matched pixel, 0 to 1: how far the best sum lies below the best one elsewhere (`(second − best) /
+/// Returns the confidence of a matched pixel, 0 to 1: how far the best sum is below the best one elsewhere (`(second − best) /
 /// second`, the naive peak ratio of Hu & Mordohai, "A quantitative evaluation of confidence measures for stereo vision",
 /// PAMI 2012); 0 for filled pixels.
 pub(crate) fn confidence(winner: &Winner, state: PixelState) -> f32 {
@@ -17,13 +17,13 @@ pub(crate) fn confidence(winner: &Winner, state: PixelState) -> f32 {
     }
 }
 
-/// Standard deviation of a matched disparity in px; NaN for filled pixels: `√((1 + cost) / rise) / 5`.
+/// Returns the standard deviation of a matched disparity in px; NaN for filled pixels: `√((1 + cost) / rise) / 5`.
 ///
-/// Sums that rise by `rise` per pixel place their minimum to within the bits by which they are uncertain over the rise; but the sums are
-/// of paths that share their costs, and smoothing averages what is least sure the most. The form and its factor are those that describe
-/// errors best on nine generated scenes of four kinds (seeds 300 to 304), as they are, at one stop less, and with noise of 3 and 8
-/// gray levels added: of each of the 36 pairs 53 to 78 % of the errors lie within one standard deviation and 88 % of all within two;
-/// their tails are heavier than a normal distribution's. Stronger noise makes it too small, down to half of the errors within one.
+/// The minimum of sums that rise by `rise` per pixel is uncertain by their own uncertainty over the rise; but the sums are of paths that
+/// share their costs, and smoothing averages the least certain disparities most. Form and factor were fitted to nine generated scenes of
+/// four kinds (seeds 300 to 304), as they are, at one stop less, and with noise of 3 and 8 gray levels: of each of the 36 pairs 53 to
+/// 78 % of the errors are within one standard deviation and 88 % of all within two; the tails are heavier than a normal distribution's.
+/// Under stronger noise it is too small: down to half of the errors are within one.
 pub(crate) fn sigma(winner: &Winner, state: PixelState) -> f32 {
     if state != PixelState::Matched {
         return f32::NAN;
@@ -38,7 +38,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lone_deep_minimum_is_surer_than_a_shallow_one() {
+    fn a_deep_minimum_has_higher_confidence_than_a_shallow_one() {
         let deep = Winner { index: 3, cost: 10, second: 200, below: 90, above: 80 };
         let shallow = Winner { index: 3, cost: 100, second: 110, below: 104, above: 103 };
         let (a, b) = (confidence(&deep, PixelState::Matched), confidence(&shallow, PixelState::Matched));
@@ -49,7 +49,7 @@ mod tests {
     }
 
     #[test]
-    fn ends_and_empty_sums_are_numbers() {
+    fn minima_at_the_ends_and_zero_sums_give_finite_values() {
         let flat = Winner { index: 0, cost: 0, second: 0, below: NO_SUM, above: NO_SUM };
         assert_eq!(confidence(&flat, PixelState::Matched), 0.0);
         assert!(sigma(&flat, PixelState::Matched).is_finite());

@@ -1,4 +1,4 @@
-//! What matching costs, from the census bits, and the penalties along the paths.
+//! Matching costs from census bits, and the smoothness penalties of the aggregation paths.
 
 use crate::StereoOptions;
 use crate::coarse_prior::Prior;
@@ -8,40 +8,40 @@ use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
 use std::ops::Range;
 
-/// What both sweeps read.
+/// Input of both sweeps.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Frame<'a> {
     pub(crate) width: usize,
     pub(crate) height: usize,
     pub(crate) min_disparity: i64,
-    /// Number of disparities asked for.
+    /// Number of disparities, without padding.
     pub(crate) disparities: usize,
     pub(crate) layout: Layout,
-    /// Bytes that describe a pixel: its census bits, then, with a cap, what the intensity_cost compares.
+    /// Bytes that describe a pixel: its census bits, then, with a cap, the value of the intensity cost.
     pub(crate) planes: usize,
     /// The bytes of the left image, each row plane by plane.
     pub(crate) left: &'a [u8],
     /// The bytes of the right image, each row mirrored so that disparities ascend: element `j` of a row is column
-    /// `width − 1 − min_disparity − j`, and the match of column `x` at index `k` is element `width − 1 − x + k`. A row
-    /// holds the elements of phase 0 plane by plane, then those of phase 1 and so on.
+    /// `width − 1 − min_disparity − j`, and the correspondence of column `x` at index `k` is element `width − 1 − x + k`. A row
+    /// has the elements of phase 0 plane by plane, then those of phase 1 and so on.
     pub(crate) right: &'a [u8],
-    /// The costs, pixel by pixel in the order of `layout`, where they are not made of the bytes.
+    /// The costs, pixel by pixel in `layout`, if they are given rather than computed.
     pub(crate) given: Option<&'a [u8]>,
-    /// Where pixels are guided to, for all pixels or none.
+    /// Priors, of all pixels or none.
     pub(crate) priors: &'a [Prior],
-    /// The most that the intensity_cost adds to the bits.
+    /// Maximum of the intensity cost.
     pub(crate) intensity_cap: Option<u8>,
-    /// Gray values of the left image, 0 to 255.
+    /// Gray levels of the left image, 0 to 255.
     pub(crate) gray: &'a [u8],
     pub(crate) p1: u8,
     pub(crate) p2: &'a Penalties,
-    /// Whether [`crate::winner::Winner::second`] is wanted.
+    /// Whether [`crate::winner::Winner::second`] is computed.
     pub(crate) second: bool,
 }
 
 impl Frame<'_> {
-    /// Indices whose match lies inside the right image: its column falls with the index, so that the first ones may lie
-    /// right of the image and the last ones left of it.
+    /// Returns the indices whose correspondence is inside the right image: its column decreases with the index, so that the first ones may
+    /// be right of the image and the last ones left of it.
     #[inline(always)]
     fn inside(&self, x: usize) -> Range<usize> {
         let column = x as i64 - self.min_disparity;
@@ -49,8 +49,8 @@ impl Frame<'_> {
         (column - (self.width as i64 - 1)).clamp(0, n) as usize..(column + 1).clamp(0, n) as usize
     }
 
-    /// Costs of the pixels `xs` of row `y` at every disparity; 255 beyond the last one, which keeps those lanes from ever
-    /// winning or lending to their neighbors, since additions saturate. Groups are of `BLOCKS` blocks.
+    /// Computes the costs of the pixels `xs` of row `y` at every disparity; 255 in the padding, so that those lanes never win and never
+    /// extend to their neighbors, since additions saturate. Groups have `BLOCKS` blocks.
     #[inline(always)]
     pub(crate) fn costs<S: Simd, const BLOCKS: usize>(&self, simd: S, y: usize, xs: Range<usize>, out: &mut [u8]) {
         match self.planes - usize::from(self.intensity_cap.is_some()) {
@@ -79,7 +79,7 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
     let row = &frame.right[y * planes * n * phase..][..planes * n * phase];
     let out = &mut out[..count * groups * group];
     let here = |p: usize| &left[p * width + xs.start..][..count];
-    // Pixels `n` apart find their candidates in the same phases, one element further.
+    // Pixels `n` apart have their candidates in the same phases, one element further.
     for class in 0..n.min(count) {
         let start = width - xs.end + class;
         let steps = (count - class).div_ceil(n);
@@ -100,7 +100,7 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
                 bits[p] = S::u8s::splat(simd, described[p][pixel]);
             }
             for g in 0..groups {
-                // Candidates of the same vector in later groups follow at once.
+                // Candidates of the same vector in later groups are contiguous.
                 let at = step + g * lanes;
                 for v in 0..n {
                     let mut differing = S::u8s::splat(simd, 0);
@@ -131,11 +131,11 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
     if let Some(priors) = frame.priors.get(y * width..(y + 1) * width) {
         for (prior, out) in priors[xs.clone()].iter().zip(out.chunks_exact_mut(groups * group)) {
             if prior.cap > 0 {
-                guide::<S, BLOCKS>(simd, *prior, out);
+                add_prior::<S, BLOCKS>(simd, *prior, out);
             }
         }
     }
-    // Only near the ends of a row do pixels look beyond the right image.
+    // Only pixels near the ends of a row have correspondences outside the right image.
     let all = |x: usize| frame.inside(x).len() == frame.disparities;
     let (first, last) = (xs.start, xs.end);
     let border = |x: &usize| !all(*x);
@@ -146,17 +146,17 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
     let (middle, out_right) = rest.split_at_mut((count - left - right) * groups * group);
     let ends = [(first..first + left, out_left), (last - right..last, out_right)];
     for (x, out) in ends.into_iter().flat_map(|(xs, out)| xs.zip(out.chunks_exact_mut(groups * group))) {
-        borders::<S, BLOCKS>(simd, frame, frame.inside(x), out);
+        set_border_costs::<S, BLOCKS>(simd, frame, frame.inside(x), out);
     }
     if frame.disparities < groups * group {
-        // A loop: within `for_each` the instructions would be called one by one, since it is not compiled for the instruction set.
+        // Not `for_each`, which is not compiled for the instruction set: its SIMD operations would be function calls.
         for out in middle.chunks_exact_mut(groups * group) {
             pad::<S, BLOCKS>(simd, frame.disparities, out);
         }
     }
 }
 
-/// Replaces the costs of disparities beyond the last one.
+/// Sets the costs of the padding.
 #[inline(always)]
 fn pad<S: Simd, const BLOCKS: usize>(simd: S, disparities: usize, out: &mut [u8]) {
     let lanes = S::u8s::LEN;
@@ -173,32 +173,32 @@ fn pad<S: Simd, const BLOCKS: usize>(simd: S, disparities: usize, out: &mut [u8]
     }
 }
 
-/// Adds what lies far from the prior of a pixel.
+/// Adds the cost of the distance from the prior of a pixel.
 #[inline(always)]
-fn guide<S: Simd, const BLOCKS: usize>(simd: S, prior: Prior, out: &mut [u8]) {
+fn add_prior<S: Simd, const BLOCKS: usize>(simd: S, prior: Prior, out: &mut [u8]) {
     let lanes = S::u8s::LEN;
     let group = BLOCKS * BLOCK;
     let n = group / lanes;
     let first = S::u8s::from_fn(simd, |lane| (lane * n) as u8);
     let (cap, one) = (S::u8s::splat(simd, prior.cap), S::u8s::splat(simd, 1));
     for (g, out) in out.chunks_exact_mut(group).enumerate() {
-        // Groups hold at most 128 indices: beyond its ends, what counts is only that the prior is farther away than the cap.
+        // Groups have at most 128 indices: outside its own group, a prior is only required to be farther than the cap.
         let local = i32::from(prior.index) - (g * group) as i32;
         let (at, beyond) = (local.clamp(0, 255) as u8, (-local).clamp(0, 127) as u8);
         let (at, beyond) = (S::u8s::splat(simd, at), S::u8s::splat(simd, beyond));
         for v in 0..n {
             let k = first + v as u8;
-            let away = (k.max(at) - k.min(at)) + beyond;
-            let away = away - away.min(one);
+            let distance = (k.max(at) - k.min(at)) + beyond;
+            let distance = distance - distance.min(one);
             let out = &mut out[v * lanes..][..lanes];
-            (S::u8s::from_slice(simd, out) + away.min(cap)).store_slice(out);
+            (S::u8s::from_slice(simd, out) + distance.min(cap)).store_slice(out);
         }
     }
 }
 
-/// Replaces the costs of matches outside the right image, and of disparities beyond the last one.
+/// Sets the costs of correspondences outside the right image, and of the padding.
 #[inline(always)]
-fn borders<S: Simd, const BLOCKS: usize>(simd: S, frame: &Frame<'_>, inside: Range<usize>, out: &mut [u8]) {
+fn set_border_costs<S: Simd, const BLOCKS: usize>(simd: S, frame: &Frame<'_>, inside: Range<usize>, out: &mut [u8]) {
     let lanes = S::u8s::LEN;
     let group = BLOCKS * BLOCK;
     let n = group / lanes;
@@ -233,11 +233,11 @@ fn borders<S: Simd, const BLOCKS: usize>(simd: S, frame: &Frame<'_>, inside: Ran
     }
 }
 
-/// P2 − P1 by the absolute difference of neighboring gray values.
+/// P2 − P1 by the absolute difference of neighboring gray levels.
 #[derive(Debug, Clone)]
 pub(crate) struct Penalties {
     table: [u8; 256],
-    /// The differences from which on it is one less; several where it falls by more.
+    /// The differences at which it decreases by one; repeated for larger decreases.
     steps: Vec<u8>,
 }
 
@@ -249,7 +249,7 @@ impl Penalties {
         Self { table, steps }
     }
 
-    /// P2 − P1 between the pixels of two rows.
+    /// Computes P2 − P1 between the pixels of two rows.
     pub(crate) fn between<S: Simd>(&self, simd: S, a: &[u8], b: &[u8], out: &mut [u8]) {
         between(simd, self, a, b, out);
     }

@@ -1,10 +1,10 @@
-//! From disparity to depth, and back into space.
+//! Depth from disparity, and triangulation of the pixels of a depth map.
 
 use cv_core::{GrayF32, ImageView, PointCloud};
 use nalgebra::Matrix4;
 use rayon::prelude::*;
 
-/// What turns disparities of a rectified pair into lengths.
+/// The parameters that relate disparity and depth of a rectified pair.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct StereoGeometry {
@@ -21,7 +21,7 @@ pub struct StereoGeometry {
     pub offset: f64,
 }
 
-/// A numbers that cannot be a stereo geometry.
+/// Why numbers are not a valid stereo geometry.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum GeometryError {
@@ -46,7 +46,7 @@ pub enum GeometryError {
 }
 
 impl StereoGeometry {
-    /// A geometry whose principal point is the middle of images of this size.
+    /// Creates a geometry whose principal point is the center of images of this size.
     ///
     /// # Errors
     /// As [`StereoGeometry::validate`].
@@ -57,7 +57,7 @@ impl StereoGeometry {
         Ok(geometry)
     }
 
-    /// Checks that the numbers make sense.
+    /// Checks that focal length and baseline are positive and all numbers are finite.
     ///
     /// # Errors
     /// [`GeometryError`] with the numbers.
@@ -72,24 +72,24 @@ impl StereoGeometry {
         Ok(())
     }
 
-    /// Depth of a disparity; NaN where the disparity is NaN or puts the point at infinity or behind the camera.
+    /// Returns the depth of a disparity; NaN for a NaN disparity, and for points at infinity or behind the camera.
     pub fn depth(&self, disparity: f32) -> f32 {
         let d = f64::from(disparity) + self.offset;
         if d > 0.0 { (self.focal * self.baseline / d) as f32 } else { f32::NAN }
     }
 
-    /// Disparity of a depth: the inverse of [`StereoGeometry::depth`].
+    /// Returns the disparity of a depth: the inverse of [`StereoGeometry::depth`].
     pub fn disparity(&self, depth: f64) -> f64 {
         self.focal * self.baseline / depth - self.offset
     }
 
-    /// How far off a depth is when its disparity is off by `sigma` px: `Z² / (f B) σ`, to first order.
+    /// Returns the standard deviation of a depth whose disparity has a standard deviation of `sigma` px: `Z² / (f B) σ`, to first order.
     pub fn depth_uncertainty(&self, depth: f32, sigma: f32) -> f32 {
         let z = f64::from(depth);
         (z * z / (self.focal * self.baseline) * f64::from(sigma)) as f32
     }
 
-    /// The matrix that takes `(x, y, d, 1)` to homogeneous coordinates of the point (`Q` in OpenCV).
+    /// Returns the matrix that maps `(x, y, d, 1)` to the homogeneous coordinates of the point (`Q` in OpenCV).
     pub fn q(&self) -> Matrix4<f64> {
         let b = self.baseline;
         Matrix4::new(
@@ -112,7 +112,7 @@ impl StereoGeometry {
         )
     }
 
-    /// Depth of every pixel; NaN where the disparity is NaN or the depth outside `range` (nearest, farthest).
+    /// Returns the depth of every pixel; NaN where the disparity is NaN or the depth outside `range` (nearest, farthest).
     pub fn depth_map(&self, disparity: ImageView<'_, f32, 1>, range: (f32, f32)) -> GrayF32 {
         let (width, height) = disparity.size();
         let mut depth = GrayF32::new(width, height, [f32::NAN]);
@@ -127,8 +127,8 @@ impl StereoGeometry {
         depth
     }
 
-    /// The pixels of a depth map as points in space (X right, Y down, Z forward from the left camera, in the unit of the baseline), row by row,
-    /// with their colors. Pixels without a depth are left out; where the images differ in size, so is what only one of them has.
+    /// Triangulates the pixels of a depth map (X right, Y down, Z forward from the left camera, in the unit of the baseline), row by row,
+    /// with their colors. Pixels without depth are left out; if the images differ in size, so are pixels outside either of them.
     pub fn cloud(&self, depth: ImageView<'_, f32, 1>, color: ImageView<'_, u8, 3>) -> PointCloud {
         let (width, height) = (depth.width().min(color.width()), depth.height().min(color.height()));
         let mut cloud = PointCloud::default();
@@ -155,7 +155,7 @@ mod tests {
 
     #[test]
     fn a_point_comes_back_from_its_two_projections() {
-        // A point 2 m ahead, 0.5 m right, 0.3 m up, seen by both cameras of the geometry.
+        // A point 2 m ahead, 0.5 m right, 0.3 m up, projected into both cameras of the geometry.
         let (x, y, z) = (0.5, -0.3, 2.0);
         let left = 500.0 * x / z + 320.0;
         let right = 500.0 * (x - 0.12) / z + 323.0;

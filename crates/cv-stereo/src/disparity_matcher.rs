@@ -1,16 +1,17 @@
-//! What finds disparities: our matcher, and those of other crates.
+//! The trait of dense stereo matchers: the one of this crate, and those of others.
 
 use crate::{DisparityMap, Intensity, StereoError, StereoMatcher};
 use cv_core::{GrayF32, ImageView, Progress};
 
-/// Finds the disparities of rectified pairs of images with `C` channels of `T`.
+/// Computes the disparities of rectified pairs of images with `C` channels of `T`.
 ///
-/// `tests/own_matcher.rs` of this crate holds a small one.
+/// `tests/own_matcher.rs` of this crate has a small implementation.
 pub trait DisparityMatcher<T: Intensity, const C: usize> {
-    /// Disparities of `left`, into a map of any size (its memory may be used again). The images are rectified: a scene point has the same y in both.
+    /// Computes the disparities of `left`, into a map of any size (its memory may be reused). The images are rectified: a scene point
+    /// has the same y in both.
     ///
     /// # Errors
-    /// [`StereoError`] where the images do not fit together, or the matcher cannot work on them.
+    /// [`StereoError`] if the images differ in size, or are not supported by the matcher.
     fn compute_into(
         &mut self,
         left: ImageView<'_, T, C>,
@@ -19,16 +20,16 @@ pub trait DisparityMatcher<T: Intensity, const C: usize> {
         progress: &dyn Progress,
     ) -> Result<(), StereoError>;
 
-    /// Smallest disparity that is tried, in px, and how many.
+    /// Returns the smallest disparity of the search range, in px, and the number of disparities.
     fn disparities(&self) -> (i32, usize);
 
-    /// How sure each disparity of the last pair is, 0 to 1, 0 where it was filled in. `None`, the default, where that is not known.
+    /// Returns the confidence of each disparity of the last pair, 0 to 1, 0 for filled pixels. `None`, the default, if unknown.
     fn confidence(&self, map: &DisparityMap) -> Option<GrayF32> {
         let _ = map;
         None
     }
 
-    /// Standard deviation in px of each disparity of the last pair, NaN where that is not known: by default everywhere.
+    /// Returns the standard deviation in px of each disparity of the last pair, NaN where unknown: by default everywhere.
     fn uncertainty(&self, map: &DisparityMap) -> GrayF32 {
         let (width, height) = map.disparity.size();
         GrayF32::new(width, height, [f32::NAN])

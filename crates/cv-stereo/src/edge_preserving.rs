@@ -1,9 +1,9 @@
-//! Edge-preserving smoothing, guided by the photograph.
+//! Edge-preserving smoothing, guided by the left image.
 //!
-//! Two ways. The bilateral one first moves the outlines of things to where the photograph has them: a window that
-//! straddles an outline sees the nearer side of it, so that matching draws things a pixel or two too wide. Then it
-//! averages each surface. The other one is the fast global smoother (Min et al., "Fast global image smoothing based on
-//! weighted least squares", TIP 2014), weighted by what was matched, which OpenCV's users know as its WLS filter.
+//! The bilateral filter first moves depth discontinuities to image edges: a matching window across a discontinuity matches its nearer
+//! side, so that foreground objects become a pixel or two too wide. Then it averages each surface. The other filter is the fast global
+//! smoother (Min et al., "Fast global image smoothing based on weighted least squares", TIP 2014), with the valid pixels as weights:
+//! OpenCV's WLS filter.
 
 use crate::{PixelState, Smoothing};
 use cv_core::{Cancelled, Stage};
@@ -11,39 +11,39 @@ use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
 
-/// Reach of a window, and the spacing of the pixels in it that are looked at: 25 of 81 serve as well as all.
-const REACH: usize = 4;
+/// Radius of a window in px, and the spacing of its samples: 25 of 81 give the same result as all.
+const RADIUS: usize = 4;
 const SPACING: usize = 2;
-/// Room on both sides of a row: the reach, and on the right as much as a vector may run over.
-const LEFT: usize = REACH;
-const RIGHT: usize = REACH + 16;
-/// Neighbors that differ by more than so many px belong to different surfaces. On the same scenes 2 leaves 1.61 % of errors
-/// above 1 px and 0.62 % above 2 px; 1 leaves 1.78 and 0.68, 1.5 leaves 1.64 and 0.65, 3 leaves 1.68 and 0.60.
-const STEP: f32 = 2.0;
+/// Padding of rows: the radius, and on the right also the width of a vector.
+const LEFT: usize = RADIUS;
+const RIGHT: usize = RADIUS + 16;
+/// Difference in px from which on neighbors are of different surfaces. On sixteen generated scenes 2 leaves 1.61 % of errors above 1 px and
+/// 0.62 % above 2 px; 1 leaves 1.78 and 0.68, 1.5 leaves 1.64 and 0.65, 3 leaves 1.68 and 0.60.
+const MAX_STEP: f32 = 2.0;
 
-/// Memory of [`smooth`], kept between frames: rows with room on both sides, and rows of nothing above and below.
+/// Buffers of [`smooth`], reused between frames: padded rows, and rows of zeros above and below.
 #[derive(Debug, Default)]
 pub(crate) struct Planes {
     /// Disparity, 0 where unknown.
     disparity: Vec<f32>,
-    /// With outlines moved.
+    /// With depth discontinuities moved to image edges.
     moved: Vec<f32>,
-    /// Gray values 0 to 255.
+    /// Gray levels 0 to 255.
     gray: Vec<f32>,
-    /// 1, and 0 where the disparity is unknown.
+    /// 1, or 0 where the disparity is unknown.
     weight: Vec<f32>,
 }
 
-/// Bytes that [`smooth`] holds on to.
+/// Returns the bytes of the buffers of [`smooth`].
 pub(crate) fn bytes(smoothing: Smoothing, width: usize, height: usize) -> usize {
     let planes = match smoothing {
         Smoothing::None => 0,
         Smoothing::Bilateral { .. } | Smoothing::LeastSquares { .. } => 4,
     };
-    planes * size_of::<f32>() * (width.saturating_add(LEFT + RIGHT)).saturating_mul(height.saturating_add(2 * REACH))
+    planes * size_of::<f32>() * (width.saturating_add(LEFT + RIGHT)).saturating_mul(height.saturating_add(2 * RADIUS))
 }
 
-/// Smooths a map; unknown pixels stay unknown, and those whose outline moves over them are no longer what was matched there.
+/// Smooths a map. Unknown pixels stay unknown; matched pixels across which a discontinuity moves become mismatched.
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn smooth(
     level: Level,
@@ -66,11 +66,11 @@ pub(crate) fn smooth(
         Smoothing::Bilateral { sigma } => {
             let Planes { disparity: before, moved, gray, weight } = planes;
             let [before, gray, weight] = [before, gray, weight].map(|plane| plane.as_slice());
-            let inside = &mut moved[REACH * stride..(REACH + height) * stride];
+            let inside = &mut moved[RADIUS * stride..(RADIUS + height) * stride];
             inside.par_chunks_mut(stride).enumerate().try_for_each(|(y, out)| {
                 stage.check()?;
                 let rows = Rows { disparity: before, gray, weight, stride, y, scale: 1.0 / sigma };
-                dispatch!(level, simd => move_outlines(simd, rows, &mut out[LEFT..LEFT + width.next_multiple_of(16)]));
+                dispatch!(level, simd => move_discontinuities(simd, rows, &mut out[LEFT..LEFT + width.next_multiple_of(16)]));
                 Ok(())
             })?;
             disparity.par_chunks_mut(width).zip(states.par_chunks_mut(width)).enumerate().try_for_each_init(
@@ -79,10 +79,10 @@ pub(crate) fn smooth(
                     stage.check()?;
                     let rows = Rows { disparity: moved, gray, weight, stride, y, scale: 1.0 / sigma };
                     dispatch!(level, simd => average(simd, rows, smoothed));
-                    let pixels = rows.at(0, REACH, REACH);
+                    let pixels = rows.at(0, RADIUS, RADIUS);
                     let pixels = before[pixels..pixels + width].iter().zip(&moved[pixels..pixels + width]);
                     for ((state, (before, moved)), d) in states.iter_mut().zip(pixels).zip(&*out) {
-                        // Without a branch: filled and unknown pixels stay what they are.
+                        // Branch-free: filled and unknown pixels keep their state.
                         let now = if *state == PixelState::Matched { PixelState::Mismatched } else { *state };
                         *state = if (before == moved) | d.is_nan() { *state } else { now };
                     }
@@ -96,7 +96,7 @@ pub(crate) fn smooth(
         Smoothing::LeastSquares { lambda, sigma } => {
             least_squares(planes, width, height, lambda, sigma, stage)?;
             disparity.par_chunks_mut(width).enumerate().for_each(|(y, out)| {
-                let from = (REACH + y) * stride + LEFT;
+                let from = (RADIUS + y) * stride + LEFT;
                 let (value, weight) = (&planes.disparity[from..][..width], &planes.weight[from..][..width]);
                 for ((d, &v), &w) in out.iter_mut().zip(value).zip(weight) {
                     if !d.is_nan() && w > 0.0 {
@@ -112,9 +112,9 @@ pub(crate) fn smooth(
 impl Planes {
     fn fill(&mut self, level: Level, disparity: &[f32], gray: &[u8], width: usize) {
         let stride = width + LEFT + RIGHT;
-        let len = (disparity.len() / width + 2 * REACH) * stride;
+        let len = (disparity.len() / width + 2 * RADIUS) * stride;
         for plane in [&mut self.disparity, &mut self.moved, &mut self.gray, &mut self.weight] {
-            // Another size: the room around must be zero again.
+            // Another size: the padding must be zero again.
             if plane.len() != len {
                 plane.clear();
                 plane.resize(len, 0.0);
@@ -122,7 +122,7 @@ impl Planes {
         }
         let rows = |plane| {
             let plane: &mut Vec<f32> = plane;
-            plane.par_chunks_mut(stride).skip(REACH)
+            plane.par_chunks_mut(stride).skip(RADIUS)
         };
         let planes = rows(&mut self.disparity).zip(rows(&mut self.gray)).zip(rows(&mut self.weight));
         let pixels = disparity.par_chunks(width).zip(gray.par_chunks(width));
@@ -130,7 +130,7 @@ impl Planes {
             let inside = LEFT..LEFT + width;
             let out = [&mut d[inside.clone()], &mut g[inside.clone()], &mut w[inside]];
             dispatch!(level, simd => fill_row(simd, out, disparity, gray));
-            // The last frame may have been of another width with the same number of pixels.
+            // The last frame may have had another width with the same number of pixels.
             for row in [d, g, w] {
                 row[..LEFT].fill(0.0);
                 row[LEFT + width..].fill(0.0);
@@ -139,7 +139,7 @@ impl Planes {
     }
 }
 
-/// Disparity, gray values and weights of a row, without its room.
+/// Copies disparities, gray levels and weights of a row, without padding.
 #[simd]
 fn fill_row<S: Simd>(_: S, [d, g, w]: [&mut [f32]; 3], disparity: &[f32], gray: &[u8]) {
     for (out, &value) in d.iter_mut().zip(disparity) {
@@ -153,7 +153,7 @@ fn fill_row<S: Simd>(_: S, [d, g, w]: [&mut [f32]; 3], disparity: &[f32], gray: 
     }
 }
 
-/// A row with those around it.
+/// A row with those above and below.
 #[derive(Clone, Copy)]
 struct Rows<'a> {
     disparity: &'a [f32],
@@ -161,27 +161,27 @@ struct Rows<'a> {
     weight: &'a [f32],
     stride: usize,
     y: usize,
-    /// Share of the weight lost per gray level of difference.
+    /// Decrease of the weight per gray level of difference.
     scale: f32,
 }
 
 impl Rows<'_> {
-    /// Where the pixel `(dx, dy)` from the first of a vector at `x` lies; both count from −[`REACH`].
+    /// Returns the index of the pixel at offset `(dx, dy)` from the first of a vector at `x`; both count from −[`RADIUS`].
     #[inline(always)]
     fn at(&self, x: usize, dx: usize, dy: usize) -> usize {
         (self.y + dy) * self.stride + x + dx
     }
 }
 
-/// A pixel within [`STEP`] of whose disparity not all of its neighbors lie takes the disparity of the other side of the
-/// step where more of the pixels around that look like it are of the other side.
+/// Moves depth discontinuities: a pixel beside a step of more than [`MAX_STEP`] takes the mean disparity of the other side if more of the
+/// pixels of similar gray level in its window are on the other side.
 #[simd]
-fn move_outlines<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
+fn move_discontinuities<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
     let lanes = S::f32s::LEN;
     let load = |plane: &[f32], at: usize| S::f32s::from_slice(simd, &plane[at..at + lanes]);
     let zero = S::f32s::splat(simd, 0.0);
     for x in (0..out.len()).step_by(lanes) {
-        let center = rows.at(x, REACH, REACH);
+        let center = rows.at(x, RADIUS, RADIUS);
         let here = load(rows.disparity, center);
         let (mut low, mut high) = (here, here);
         for (dx, dy) in [(2, 4), (3, 4), (5, 4), (6, 4), (4, 2), (4, 3), (4, 5), (4, 6)] {
@@ -190,14 +190,14 @@ fn move_outlines<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
             low = low.min(value);
             high = high.max(value);
         }
-        let step = (high - low).simd_gt(S::f32s::splat(simd, STEP));
+        let step = (high - low).simd_gt(S::f32s::splat(simd, MAX_STEP));
         let mut result = here;
         if step.any_true() {
             let middle = (low + high) * 0.5;
             let gray = load(rows.gray, center);
             let [mut near, mut near_sum, mut all, mut all_sum] = [zero; 4];
-            for dy in (0..=2 * REACH).step_by(SPACING) {
-                for dx in (0..=2 * REACH).step_by(SPACING) {
+            for dy in (0..=2 * RADIUS).step_by(SPACING) {
+                for dx in (0..=2 * RADIUS).step_by(SPACING) {
                     let at = rows.at(x, dx, dy);
                     let value = load(rows.disparity, at);
                     let alike = (S::f32s::splat(simd, 1.0) - (load(rows.gray, at) - gray).abs() * rows.scale).max(zero);
@@ -214,7 +214,7 @@ fn move_outlines<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
             let own = is_near.select(near, far);
             let other = is_near.select(far, near);
             let sum = is_near.select(far_sum, near_sum);
-            // Half a pixel's weight at least: less is no evidence.
+            // At least the weight of half a pixel, as evidence.
             let moves = step & other.simd_gt(own) & other.simd_gt(S::f32s::splat(simd, 0.5));
             result = moves.select(sum / other, here);
         }
@@ -222,22 +222,23 @@ fn move_outlines<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
     }
 }
 
-/// Weighted mean of the pixels around that look alike and lie within [`STEP`].
+/// Computes the mean of the pixels of the window within [`MAX_STEP`], weighted by the similarity of their gray levels.
 #[simd]
 fn average<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
     let lanes = S::f32s::LEN;
     let load = |plane: &[f32], at: usize| S::f32s::from_slice(simd, &plane[at..at + lanes]);
     let zero = S::f32s::splat(simd, 0.0);
     for x in (0..out.len()).step_by(lanes) {
-        let center = rows.at(x, REACH, REACH);
+        let center = rows.at(x, RADIUS, RADIUS);
         let (here, gray) = (load(rows.disparity, center), load(rows.gray, center));
         let (mut all, mut sum) = (S::f32s::splat(simd, 1e-6), zero);
-        for dy in (0..=2 * REACH).step_by(SPACING) {
-            for dx in (0..=2 * REACH).step_by(SPACING) {
+        for dy in (0..=2 * RADIUS).step_by(SPACING) {
+            for dx in (0..=2 * RADIUS).step_by(SPACING) {
                 let at = rows.at(x, dx, dy);
                 let off = load(rows.disparity, at) - here;
                 let alike = (S::f32s::splat(simd, 1.0) - (load(rows.gray, at) - gray).abs() * rows.scale).max(zero);
-                let weight = off.abs().simd_le(S::f32s::splat(simd, STEP)).select(alike * load(rows.weight, at), zero);
+                let weight =
+                    off.abs().simd_le(S::f32s::splat(simd, MAX_STEP)).select(alike * load(rows.weight, at), zero);
                 all += weight;
                 sum += weight * off;
             }
@@ -246,7 +247,7 @@ fn average<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
     }
 }
 
-/// Three rounds of exact one-dimensional smoothing along rows and columns, of weighted disparity and of the weights.
+/// Runs three rounds of exact one-dimensional smoothing along rows and columns, of the weighted disparities and of the weights.
 fn least_squares(
     planes: &mut Planes,
     width: usize,
@@ -261,20 +262,20 @@ fn least_squares(
     for (d, &w) in disparity.iter_mut().zip(weight.iter()) {
         *d *= w;
     }
-    let likeness = |a: f32, b: f32| (-(a - b).abs() / sigma).exp();
+    let similarity = |a: f32, b: f32| (-(a - b).abs() / sigma).exp();
     for round in 1..=ROUNDS {
-        // Falls by four each round (equation 13 of the paper).
+        // Decreases by four each round (equation 13 of the paper).
         let strength = 1.5 * 4f32.powi(ROUNDS - round) / (4f32.powi(ROUNDS) - 1.0) * lambda;
         let rows = disparity.par_chunks_mut(stride).zip(weight.par_chunks_mut(stride)).zip(gray.par_chunks(stride));
-        rows.skip(REACH).take(height).try_for_each_init(
+        rows.skip(RADIUS).take(height).try_for_each_init(
             || vec![0.0; width],
             |factors, ((d, w), g)| {
                 stage.check()?;
                 let (d, w, g) = (&mut d[LEFT..LEFT + width], &mut w[LEFT..LEFT + width], &g[LEFT..LEFT + width]);
-                // Thomas' algorithm for the system 1 + A, of both right-hand sides at once.
+                // Thomas algorithm for the system 1 + A, with both right-hand sides at once.
                 let mut before = 0.0;
                 for x in 0..width {
-                    let after = if x + 1 < width { -strength * likeness(g[x], g[x + 1]) } else { 0.0 };
+                    let after = if x + 1 < width { -strength * similarity(g[x], g[x + 1]) } else { 0.0 };
                     let diagonal = 1.0 - before - after;
                     let scale = if x > 0 { 1.0 / (diagonal - before * factors[x - 1]) } else { 1.0 / diagonal };
                     factors[x] = after * scale;
@@ -290,16 +291,16 @@ fn least_squares(
                 Ok(())
             },
         )?;
-        // Columns, a row of them at a time.
-        let row = |y: usize| (REACH + y) * stride + LEFT;
+        // Along the columns, row by row.
+        let row = |y: usize| (RADIUS + y) * stride + LEFT;
         let factors = &mut moved[..];
         for y in 0..height {
             stage.check()?;
             for x in 0..width {
                 let at = row(y) + x;
                 let g = gray[at];
-                let before = if y > 0 { -strength * likeness(gray[at - stride], g) } else { 0.0 };
-                let after = if y + 1 < height { -strength * likeness(g, gray[at + stride]) } else { 0.0 };
+                let before = if y > 0 { -strength * similarity(gray[at - stride], g) } else { 0.0 };
+                let after = if y + 1 < height { -strength * similarity(g, gray[at + stride]) } else { 0.0 };
                 let up = if y > 0 {
                     (factors[at - stride], disparity[at - stride], weight[at - stride])
                 } else {
@@ -357,7 +358,7 @@ mod tests {
                     .collect();
                 let low = near.iter().copied().fold(f32::INFINITY, f32::min);
                 let high = near.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-                if high - low <= STEP {
+                if high - low <= MAX_STEP {
                     return d[i];
                 }
                 let middle = (low + high) * 0.5;
@@ -385,7 +386,7 @@ mod tests {
                 let (mut all, mut sum) = (1e-6f32, 0.0f32);
                 for j in around(i) {
                     let off = moved[j] - moved[i];
-                    let w = if off.abs() <= STEP { weight(i, j) } else { 0.0 };
+                    let w = if off.abs() <= MAX_STEP { weight(i, j) } else { 0.0 };
                     all += w;
                     sum += w * off;
                 }
@@ -429,8 +430,8 @@ mod tests {
     }
 
     #[test]
-    fn an_outline_moves_to_the_edge_of_the_photograph() {
-        // A near thing from column 20 on, matched two pixels too wide.
+    fn a_depth_discontinuity_moves_to_the_image_edge() {
+        // A near object from column 20 on, matched two pixels too wide.
         let (width, height) = (40, 30);
         let gray: Vec<u8> = (0..width * height).map(|i| if i % width < 20 { 60 } else { 180 }).collect();
         let mut d: Vec<f32> = (0..width * height).map(|i| if i % width < 18 { 5.0 } else { 12.0 }).collect();
@@ -457,7 +458,7 @@ mod tests {
     }
 
     #[test]
-    fn least_squares_smooths_a_surface_and_keeps_a_step_where_the_photograph_has_one() {
+    fn least_squares_smooths_a_surface_and_keeps_a_step_at_an_image_edge() {
         let (width, height) = (48, 32);
         let gray: Vec<u8> = (0..width * height).map(|i| if i % width < 24 { 60 } else { 180 }).collect();
         let truth = |i: usize| if i % width < 24 { 5.0 } else { 12.0 };

@@ -1,10 +1,8 @@
-//! What can be wrong with a stereo job.
+//! The error of stereo matching.
 
-use cv_core::OptionError;
+use cv_core::{Cancelled, OptionError};
 
-use cv_core::Cancelled;
-
-/// Why no disparity could be computed.
+/// Why no disparities could be computed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum StereoError {
@@ -28,15 +26,15 @@ pub enum StereoError {
         /// Height of the window.
         window_height: usize,
     },
-    /// No disparity was asked for, or more than the matcher can number.
-    #[error("{disparities} disparities asked for; 1 to {max} are possible")]
+    /// The number of disparities is 0, or above the maximum.
+    #[error("{disparities} disparities were requested; 1 to {max} are possible")]
     Range {
-        /// Number of disparities asked for.
+        /// Requested number of disparities.
         disparities: usize,
-        /// The most that can be asked for.
+        /// Maximum number of disparities.
         max: usize,
     },
-    /// No pixel of the left image has a partner at any of the disparities.
+    /// Every disparity puts every correspondence outside the right image.
     #[error(
         "disparities {min} to {max} px put every match outside images that are {width} px wide: the range must overlap −{width} to {width}"
     )]
@@ -51,18 +49,18 @@ pub enum StereoError {
     /// A penalty or threshold is out of its range.
     #[error(transparent)]
     Option(#[from] OptionError),
-    /// A float image holds NaN or infinite values.
+    /// A float image has NaN or infinite values.
     #[error("{count} samples of the {side} image are NaN or infinite")]
     NotFinite {
         /// `left` or `right`.
         side: &'static str,
-        /// How many samples.
+        /// Number of such samples.
         count: usize,
     },
-    /// The job needs more memory than allowed.
+    /// Matching needs more memory than allowed.
     #[error("matching needs {:.1} MiB and {:.1} MiB are allowed", mib(*.needed), mib(*.allowed))]
     Memory {
-        /// Bytes needed by the smallest way to do the job.
+        /// Bytes needed with the lowest strips.
         needed: usize,
         /// Bytes allowed by `max_memory`.
         allowed: usize,
@@ -72,7 +70,7 @@ pub enum StereoError {
     Cancelled(#[from] Cancelled),
 }
 
-/// Bytes as MiB.
+/// Converts bytes to MiB.
 fn mib(bytes: usize) -> f64 {
     bytes as f64 / f64::from(1 << 20)
 }

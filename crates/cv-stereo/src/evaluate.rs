@@ -1,31 +1,31 @@
-//! Scores of a disparity map against the truth, as Middlebury and KITTI count them.
+//! Evaluation of a disparity map against ground truth, with the measures of Middlebury and KITTI.
 
 use cv_core::{ImageView, Mask, quantile};
 
-/// Thresholds in px of the shares of bad pixels.
+/// Error thresholds in px of the fractions of bad pixels.
 pub const BAD_THRESHOLDS: [f32; 4] = [0.5, 1.0, 2.0, 4.0];
 
-/// Errors over a set of pixels with known truth.
+/// Errors over a set of pixels with ground truth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct DisparityScores {
-    /// Pixels with known truth.
+    /// Number of pixels with ground truth.
     pub pixels: usize,
-    /// Share of those with an estimate.
+    /// Fraction of those with an estimate.
     pub density: f64,
-    /// Share of all pixels without an estimate or with one off by more than each of [`BAD_THRESHOLDS`].
+    /// Fraction of all pixels without an estimate or with an error above each of [`BAD_THRESHOLDS`].
     pub bad: [f64; 4],
-    /// Share of the pixels with an estimate that are off by more than each of [`BAD_THRESHOLDS`].
+    /// Fraction of the pixels with an estimate whose error is above each of [`BAD_THRESHOLDS`].
     pub bad_of_valid: [f64; 4],
-    /// Mean absolute error in px, where there is an estimate; NaN where there is none at all, as all below.
+    /// Mean absolute error in px of the pixels with an estimate; NaN without any, as the fields below.
     pub average: f64,
-    /// Root of the mean squared error in px.
+    /// Root mean squared error in px.
     pub rms: f64,
-    /// Absolute error in px that half of the estimates do not exceed.
+    /// Median absolute error in px.
     pub a50: f64,
-    /// Likewise, 90 %.
+    /// 90 % quantile of the absolute error in px.
     pub a90: f64,
-    /// Likewise, 95 %.
+    /// 95 % quantile of the absolute error in px.
     pub a95: f64,
 }
 
@@ -43,18 +43,18 @@ pub enum EvaluateError {
         /// Its size.
         other: (usize, usize),
     },
-    /// There is no pixel to compare.
-    #[error("none of the {total} pixels has a known truth inside the mask")]
+    /// No pixel can be compared.
+    #[error("none of the {total} pixels has ground truth inside the mask")]
     NoTruth {
         /// Pixels of the map.
         total: usize,
     },
 }
 
-/// Compares an estimate with the truth over the pixels of `mask` (all without one) that have a finite truth.
+/// Compares an estimate with the ground truth over the pixels of `mask` (all without one) whose truth is finite.
 ///
 /// # Errors
-/// [`EvaluateError`] for maps of different sizes and where nothing can be compared.
+/// [`EvaluateError`] for maps of different sizes, and if no pixel can be compared.
 pub fn evaluate_disparity(
     estimate: ImageView<'_, f32, 1>,
     truth: ImageView<'_, f32, 1>,
@@ -91,7 +91,7 @@ pub fn evaluate_disparity(
     let average = errors.iter().map(|&e| f64::from(e)).sum::<f64>() / n;
     let rms = (errors.iter().map(|&e| f64::from(e).powi(2)).sum::<f64>() / n).sqrt();
     let missing = (pixels - errors.len()) as f64;
-    let mut at = |share: f64| quantile(&mut errors, share).map_or(f64::NAN, f64::from);
+    let mut at = |fraction: f64| quantile(&mut errors, fraction).map_or(f64::NAN, f64::from);
     let [a50, a90, a95] = [0.5, 0.9, 0.95].map(&mut at);
     Ok(DisparityScores {
         pixels,
@@ -106,7 +106,8 @@ pub fn evaluate_disparity(
     })
 }
 
-/// Pixels of the left view that the right one sees too: those whose truth the right truth confirms within 1 px.
+/// Returns the pixels of the left view that are visible in the right one: those whose ground truth the right ground truth confirms to
+/// 1 px.
 ///
 /// # Errors
 /// [`EvaluateError::SizeMismatch`].
@@ -153,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_compared_is_said() {
+    fn maps_that_cannot_be_compared_are_errors() {
         let a = GrayF32::new(3, 2, [1.0]);
         let b = GrayF32::new(2, 2, [1.0]);
         assert!(matches!(
@@ -167,12 +168,12 @@ mod tests {
     }
 
     #[test]
-    fn a_pixel_hidden_in_the_right_view_is_found() {
-        // Background at 1, one near pixel at 3 in column 5 of the left view, seen in column 2 of the right one.
+    fn a_pixel_occluded_in_the_right_view_is_excluded() {
+        // Background at 1, one near pixel at 3 in column 5 of the left view, in column 2 of the right one.
         let left = GrayF32::from_fn(8, 1, |x, _| [if x == 5 { 3.0 } else { 1.0 }]);
         let right = GrayF32::from_fn(8, 1, |x, _| [if x == 2 { 3.0 } else { 1.0 }]);
         let mask = non_occluded(left.view(), right.view()).unwrap();
-        // Column 0 leaves the view, column 3 is hidden behind the near pixel.
+        // Column 0 is out of view, column 3 is occluded by the near pixel.
         assert_eq!(mask.as_slice(), [false, true, true, false, true, true, true, true]);
     }
 }

@@ -1,4 +1,4 @@
-//! Any image to the 16-bit gray that the matcher works on.
+//! Conversion of images to the 16-bit gray levels that the matcher takes.
 
 use crate::census::{Gray, MARGIN};
 use cv_core::{ImageView, Sample, luma_u16};
@@ -6,11 +6,11 @@ use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
 
-/// A channel type the matcher takes.
+/// A channel type that the matcher accepts.
 pub trait Intensity: Sample {
-    /// On a scale of 0 to 65535.
+    /// Converts to the scale 0 to 65535.
     fn to_u16(self) -> u16;
-    /// False for NaN and infinities.
+    /// Returns false for NaN and infinities.
     fn is_number(self) -> bool {
         true
     }
@@ -30,7 +30,7 @@ impl Intensity for u16 {
     }
 }
 
-/// From 0 to 1; what lies outside is clamped.
+/// From 0 to 1; values outside are clamped.
 impl Intensity for f32 {
     #[inline]
     fn to_u16(self) -> u16 {
@@ -42,8 +42,8 @@ impl Intensity for f32 {
     }
 }
 
-/// Gray of `view` into `out` (resized), Rec. 601 weights for three or more channels. Returns how many samples are no
-/// numbers.
+/// Converts `view` to gray into `out` (resized), with Rec. 601 weights for three or more channels. Returns the number of samples that
+/// are NaN or infinite.
 pub(crate) fn to_gray<T: Intensity, const C: usize>(level: Level, view: ImageView<'_, T, C>, out: &mut Gray) -> usize {
     let (width, height) = view.size();
     (out.width, out.height) = (width, height);
@@ -67,7 +67,7 @@ pub(crate) fn to_gray<T: Intensity, const C: usize>(level: Level, view: ImageVie
         .sum()
 }
 
-/// Gray of a row; integers throughout, so that every instruction set gives the same.
+/// Converts a row; in integers, so that every instruction set gives the same bytes.
 #[simd]
 fn gray_row<S: Simd, T: Intensity, const C: usize>(_: S, pixels: &[[T; C]], out: &mut [u16]) {
     for (pixel, gray) in pixels.iter().zip(out) {
@@ -92,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_is_counted() {
+    fn nan_and_infinite_samples_are_counted() {
         let image = Image::<f32, 1>::from_vec(2, 2, vec![0.5, f32::NAN, f32::INFINITY, 2.0]).unwrap();
         let mut out = Gray::default();
         assert_eq!(to_gray(Level::new(), image.view(), &mut out), 2);

@@ -1,13 +1,12 @@
-//! The inner loops of semi-global matching. The disparity is the vector axis; everything is integer, so that every
-//! instruction set gives the same bytes.
+//! The inner loops of semi-global matching. Vectors run along the disparities; all arithmetic is in integers, so that every instruction
+//! set gives the same bytes.
 //!
-//! A sweep visits the rows from one end of the image to the other and the pixels of a row from one side to the other.
-//! At each pixel it extends the paths that arrive from pixels already visited (from the pixel before, and from the three
-//! next to it in the row before) by
+//! A sweep visits the rows in one direction and the pixels of a row in one direction. At each pixel it extends the paths from pixels
+//! already visited (the previous pixel, and three of the previous row) by
 //!
 //! `L(d) = C(d) + min(L'(d), L'(d−1) + P1, L'(d+1) + P1, min L' + P2) − min L'`
 //!
-//! and adds them up. Two sweeps from opposite corners cover all directions.
+//! and sums them. Two sweeps from opposite corners cover all directions.
 
 use crate::aligned_buffer::AlignedBuffer;
 use crate::cost::Frame;
@@ -19,7 +18,7 @@ use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
 use std::ops::Range;
 
-/// Pixels whose costs are computed at a time: 4 KiB at 128 disparities, which stay in the first cache.
+/// Pixels whose costs are computed at a time: 4 KiB at 128 disparities, which stay in the first-level cache.
 pub(crate) const TILE: usize = 32;
 
 /// State of one sweep.
@@ -27,48 +26,51 @@ pub(crate) const TILE: usize = 32;
 pub(crate) struct Sweep {
     /// True for the sweep from the bottom right.
     mirrored: bool,
-    /// Path costs of the row before, pixel by pixel: from ahead, straight, from behind, in the sense of the sweep, or
-    /// straight only. Beyond the last pixel zeros, for the path from ahead of the last one.
+    /// Path costs of the previous row, pixel by pixel: from ahead, straight, from behind, in the direction of the sweep, or straight only.
+    /// Zeros after the last pixel, for its path from ahead.
     row: AlignedBuffer<u8>,
-    /// The smallest of them: straight, from behind and from ahead, in the sense of the image.
+    /// Their minima: straight, from behind and from ahead, in image order.
     least: [Vec<u8>; 3],
-    /// The smallest of those that pixels of this row look at.
+    /// The minima of the path costs that the pixels of this row extend.
     before: [Vec<u8>; 3],
     ongoing: Ongoing,
     /// Costs of a tile of pixels.
     costs: AlignedBuffer<u8>,
+    /// Costs of this row and of the next one, where a thread of its own computes those of the next.
+    row_costs: [AlignedBuffer<u8>; 2],
     /// Sums of these pixels.
     sums: AlignedBuffer<u8>,
-    /// P2 − P1 of each pixel of the row from before; with the smallest before also straight, from behind and from ahead.
+    /// P2 − P1 of each pixel of the row for the path along it; with the minima added, straight, from behind and from ahead.
     p2: [Vec<u8>; 4],
     selection: Selection,
 }
 
-/// The paths that go on within a row.
+/// Paths that continue within a row.
 #[derive(Debug, Default)]
 struct Ongoing {
-    /// Path costs of the pixel before.
+    /// Path costs of the previous pixel.
     along: AlignedBuffer<u8>,
     along_least: u8,
-    /// Path costs of the row before at the pixel before, whose place has been taken.
+    /// Path costs of the previous row at the previous pixel, which have been overwritten.
     behind: AlignedBuffer<u8>,
 }
 
-/// What becomes of the sums of a sweep.
+/// Use of the sums of a sweep.
 pub(crate) enum Output<'a> {
-    /// Kept for the other sweep.
+    /// Stored for the other sweep.
     Store(&'a mut [u8]),
-    /// Joined with those of the other sweep.
+    /// Added to those of the other sweep, and winners selected.
     Finish { other: &'a [u8], winners: &'a mut [Winner], right: &'a mut [u16] },
 }
 
 impl Sweep {
-    /// Bytes that [`Sweep::start`] will hold on to.
+    /// Returns the bytes that [`Sweep::start`] allocates.
     pub(crate) fn bytes(width: usize, depth: usize) -> usize {
-        3 * width * depth + (2 * TILE + 3) * depth + 10 * width + Selection::bytes(width, depth)
+        let row_costs = if has_cost_threads() { 2 * width * depth } else { 0 };
+        3 * width * depth + row_costs + (2 * TILE + 3) * depth + 10 * width + Selection::bytes(width, depth)
     }
 
-    /// Prepares for a frame.
+    /// Resets the state for a frame.
     pub(crate) fn start(&mut self, frame: &Frame<'_>, mirrored: bool) {
         let depth = frame.layout.depth;
         self.mirrored = mirrored;
@@ -82,6 +84,9 @@ impl Sweep {
         self.ongoing.behind.resize(depth, 0);
         self.costs.resize(TILE * depth, 0);
         self.sums.resize(TILE * depth, 0);
+        if has_cost_threads() {
+            self.row_costs.iter_mut().for_each(|costs| costs.resize(frame.width * depth, 0));
+        }
         for p2 in &mut self.p2 {
             p2.resize(frame.width, 0);
         }
@@ -89,8 +94,12 @@ impl Sweep {
     }
 }
 
-/// Runs `sweep` over `steps` rows from row `first` (both counted in its own sense). `output` covers the same rows, in
-/// the sense of the image.
+/// Returns whether there are more threads than sweeps: then others compute the costs of the next rows.
+fn has_cost_threads() -> bool {
+    rayon::current_num_threads() > 2
+}
+
+/// Runs `sweep` over `steps` rows from row `first` (both in its own order). `output` has the same rows, in image order.
 #[simd]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn sweep_rows<S: Simd>(
@@ -103,7 +112,7 @@ pub(crate) fn sweep_rows<S: Simd>(
     eight: bool,
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
-    // The usual numbers of disparities as constants: loops over them unroll, and indices need no checks.
+    // Constant numbers of disparities: loops unroll, and indices need no bounds checks.
     let single = frame.layout.groups() == 1;
     match (eight, frame.layout.group == BLOCK, single) {
         (false, true, true) => rows::<S, 2, 1, true>(simd, frame, sweep, first, steps, output, stage),
@@ -129,75 +138,93 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
 ) -> Result<(), Cancelled> {
     let (width, height) = (frame.width, frame.height);
     let depth = if SINGLE { BLOCKS * BLOCK } else { frame.layout.depth };
-    let Sweep { mirrored, row, least, before, ongoing, costs, sums, p2, selection } = sweep;
+    let Sweep { mirrored, row, least, before, ongoing, costs, row_costs, sums, p2, selection } = sweep;
     let mirrored = *mirrored;
     let row = row.as_mut_slice();
     let costs = &mut costs.as_mut_slice()[..TILE * depth];
     let sums = &mut sums.as_mut_slice()[..TILE * depth];
+    let row_of = |t: usize| if mirrored { height - 1 - t } else { t };
+    let is_ahead = frame.given.is_none() && has_cost_threads();
+    let [row_costs, next_costs] = row_costs;
+    let (mut row_costs, mut next_costs) = (row_costs.as_mut_slice(), next_costs.as_mut_slice());
+    if is_ahead && steps > 0 {
+        frame.costs::<S, BLOCKS>(simd, row_of(first), 0..width, row_costs);
+    }
     for step in 0..steps {
         stage.add(1)?;
-        let t = first + step;
-        let y = if mirrored { height - 1 - t } else { t };
+        let y = row_of(first + step);
         // Row of `output`.
         let line = if mirrored { steps - 1 - step } else { step };
-        penalties::<S, PATHS>(simd, frame, y, mirrored, p2);
-        jumps::<S, PATHS>(simd, mirrored, least, before, p2);
-        // Paths that start at the border start from nothing.
-        ongoing.along.as_mut_slice().fill(0);
-        ongoing.behind.as_mut_slice().fill(0);
-        ongoing.along_least = 0;
-        selection.start();
-        for begin in (0..width).step_by(TILE) {
-            let end = (begin + TILE).min(width);
-            let columns = if mirrored { width - end..width - begin } else { begin..end };
-            let pixels = line * width + columns.start..line * width + columns.end;
-            let span = pixels.start * depth..pixels.end * depth;
-            let jumps = cut(p2, &columns);
-            let before = cut(before, &columns);
-            let costs = match frame.given {
-                Some(given) => &given[y * width * depth..][columns.start * depth..columns.end * depth],
-                None => {
-                    frame.costs::<S, BLOCKS>(simd, y, columns.clone(), costs);
-                    &costs[..span.len()]
-                }
-            };
-            let tile = Tile { costs, p1: frame.p1, jumps, before, mirrored };
-            let row = &mut row[begin * (PATHS - 1) * depth..];
-            let [straight, behind, ahead] = &mut *least;
-            let least = [&mut straight[columns.clone()], &mut behind[columns.clone()], &mut ahead[columns.clone()]];
-            match output {
-                Output::Store(out) => {
-                    let ends = Ends { other: &[], running: &mut [], decided: &mut [], best: &mut [], stride: 0 };
-                    extend::<S, PATHS, BLOCKS, SINGLE, 0>(simd, &tile, ongoing, row, least, &mut out[span], ends);
-                }
-                Output::Finish { other, winners, .. } => {
-                    let own = &mut sums[..span.len()];
-                    let mut best = [(NO_SUM, 0); TILE];
-                    let other = &other[span];
-                    let ends = selection.ends(frame, mirrored, &columns, other, &mut best);
-                    if mirrored {
-                        extend::<S, PATHS, BLOCKS, SINGLE, 2>(simd, &tile, ongoing, row, least, own, ends);
-                    } else {
-                        extend::<S, PATHS, BLOCKS, SINGLE, 1>(simd, &tile, ongoing, row, least, own, ends);
+        let mut extend_row = |given: Option<&[u8]>| {
+            penalties::<S, PATHS>(simd, frame, y, mirrored, p2);
+            jumps::<S, PATHS>(simd, mirrored, least, before, p2);
+            // Paths that start at the border have no previous costs.
+            ongoing.along.as_mut_slice().fill(0);
+            ongoing.behind.as_mut_slice().fill(0);
+            ongoing.along_least = 0;
+            selection.start();
+            for begin in (0..width).step_by(TILE) {
+                let end = (begin + TILE).min(width);
+                let columns = if mirrored { width - end..width - begin } else { begin..end };
+                let pixels = line * width + columns.start..line * width + columns.end;
+                let span = pixels.start * depth..pixels.end * depth;
+                let jumps = columns_of(p2, &columns);
+                let before = columns_of(before, &columns);
+                let costs = match given {
+                    Some(given) => &given[columns.start * depth..columns.end * depth],
+                    None => {
+                        frame.costs::<S, BLOCKS>(simd, y, columns.clone(), costs);
+                        &costs[..span.len()]
                     }
-                    select::<S, BLOCKS, SINGLE>(simd, frame, &best, [own, other], &mut winners[pixels]);
+                };
+                let tile = Tile { costs, p1: frame.p1, jumps, before, mirrored };
+                let row = &mut row[begin * (PATHS - 1) * depth..];
+                let [straight, behind, ahead] = &mut *least;
+                let least = [&mut straight[columns.clone()], &mut behind[columns.clone()], &mut ahead[columns.clone()]];
+                match output {
+                    Output::Store(out) => {
+                        let ends = Ends { other: &[], running: &mut [], decided: &mut [], best: &mut [], stride: 0 };
+                        extend::<S, PATHS, BLOCKS, SINGLE, 0>(simd, &tile, ongoing, row, least, &mut out[span], ends);
+                    }
+                    Output::Finish { other, winners, .. } => {
+                        let own = &mut sums[..span.len()];
+                        let mut best = [(NO_SUM, 0); TILE];
+                        let other = &other[span];
+                        let ends = selection.ends(frame, mirrored, &columns, other, &mut best);
+                        if mirrored {
+                            extend::<S, PATHS, BLOCKS, SINGLE, 2>(simd, &tile, ongoing, row, least, own, ends);
+                        } else {
+                            extend::<S, PATHS, BLOCKS, SINGLE, 1>(simd, &tile, ongoing, row, least, own, ends);
+                        }
+                        select::<S, BLOCKS, SINGLE>(simd, frame, &best, [own, other], &mut winners[pixels]);
+                    }
                 }
             }
-        }
-        if let Output::Finish { right, .. } = output {
-            let last = if mirrored { 0 } else { width - 1 };
-            selection.finish(frame, last, &mut right[line * width..][..width]);
+            if let Output::Finish { right, .. } = output {
+                let last = if mirrored { 0 } else { width - 1 };
+                selection.finish(frame, last, &mut right[line * width..][..width]);
+            }
+        };
+        if is_ahead {
+            let next = (step + 1 < steps).then(|| row_of(first + step + 1));
+            rayon::join(
+                || extend_row(Some(row_costs)),
+                || next.map(|next| frame.costs::<S, BLOCKS>(simd, next, 0..width, next_costs)),
+            );
+            (row_costs, next_costs) = (next_costs, row_costs);
+        } else {
+            extend_row(frame.given.map(|given| &given[y * width * depth..][..width * depth]));
         }
     }
     Ok(())
 }
 
-/// Some columns of each row. (`map` with a closure would be compiled once more for each kind of sweep.)
-fn cut<'a, const N: usize>(rows: &'a [Vec<u8>; N], columns: &Range<usize>) -> [&'a [u8]; N] {
+/// Returns some columns of each row. (`map` with a closure would be compiled again for each kind of sweep.)
+fn columns_of<'a, const N: usize>(rows: &'a [Vec<u8>; N], columns: &Range<usize>) -> [&'a [u8]; N] {
     std::array::from_fn(|i| &rows[i][columns.clone()])
 }
 
-/// P2 of the pixels of row `y` for each path. At a border, where paths start from nothing, any value does.
+/// Computes P2 − P1 of the pixels of row `y` for each path. At a border, where paths start, any value will do.
 #[inline(always)]
 fn penalties<S: Simd, const PATHS: usize>(
     simd: S,
@@ -212,7 +239,7 @@ fn penalties<S: Simd, const PATHS: usize>(
     let here = row(y);
     let before = row(if mirrored { (y + 1).min(height - 1) } else { y.saturating_sub(1) });
     let between = |a: &[u8], b: &[u8], out: &mut [u8]| frame.p2.between(simd, a, b, out);
-    // From the left and from the right, in the sense of the image.
+    // From the left and from the right, in image order.
     let left = |b: &[u8], out: &mut [u8]| between(&here[1..], &b[..last], &mut out[1..]);
     let right = |b: &[u8], out: &mut [u8]| between(&here[..last], &b[1..], &mut out[..last]);
     if mirrored {
@@ -231,7 +258,7 @@ fn penalties<S: Simd, const PATHS: usize>(
     between(here, before, straight);
 }
 
-/// Finds the smallest before each pixel and adds it to P2 − P1, whole rows at a time: `extend` then has but to load them.
+/// Computes the minima that the paths of each pixel extend, and adds them to P2 − P1, a row at a time: `extend` then only loads them.
 #[simd]
 fn jumps<S: Simd, const PATHS: usize>(
     _: S,
@@ -249,7 +276,7 @@ fn jumps<S: Simd, const PATHS: usize>(
     straight.copy_from_slice(straight_least);
     add(straight_jump, straight);
     if PATHS == 4 {
-        // Paths that start at the border start from nothing, which their place in `before` always holds.
+        // Paths that start at the border have no previous costs: their elements of `before` stay 0.
         let (from_left, left, from_right, right) = if mirrored {
             (ahead_least, &mut *ahead, behind_least, &mut *behind)
         } else {
@@ -262,19 +289,19 @@ fn jumps<S: Simd, const PATHS: usize>(
     }
 }
 
-/// Some pixels of a row, in the sense of the image.
+/// Some pixels of a row, in image order.
 struct Tile<'a> {
     costs: &'a [u8],
     p1: u8,
-    /// P2 − P1 from before; with the smallest before also straight, from behind and from ahead.
+    /// P2 − P1 for the path along the row; with the minima added, straight, from behind and from ahead.
     jumps: [&'a [u8]; 4],
-    /// The smallest before straight, from behind and from ahead.
+    /// The previous minima straight, from behind and from ahead.
     before: [&'a [u8]; 3],
     mirrored: bool,
 }
 
-/// Extends every path pixel by pixel and stores the sums of the extended ones, in the sense of the image. With `KEYS` also
-/// meets the sums of the other sweep: 1 from left to right, 2 from right to left.
+/// Extends every path pixel by pixel and stores the sums of the extended ones, in image order. With `KEYS` also adds the sums of the other
+/// sweep and selects winners: 1 from left to right, 2 from right to left.
 #[simd]
 fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, const KEYS: usize>(
     simd: S,
@@ -291,7 +318,7 @@ fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, 
     let along = ongoing.along.as_mut_slice();
     let behind = ongoing.behind.as_mut_slice();
     let depth = if SINGLE { group } else { along.len() };
-    // A pixel of the row before.
+    // A pixel of the previous row.
     let stride = (PATHS - 1) * depth;
     let count = tile.jumps[0].len();
     let [along_jumps, straight_jumps, behind_jumps, ahead_jumps] = tile.jumps;
@@ -319,7 +346,7 @@ fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, 
         let (here, next) = row[k * stride..][..stride + depth].split_at_mut(stride);
         let along = if SINGLE { &mut held_along[..group] } else { &mut *along };
         let behind = if SINGLE { &mut held_behind[..group] } else { &mut *behind };
-        // First of all the path from the pixel before: the next pixel waits for it.
+        // The path from the previous pixel comes first: the next pixel depends on it.
         let mut step = Step::new(simd, along_least, along_least + splat(jumps[0][at]));
         for start in (0..depth).step_by(group) {
             for v in 0..n {
@@ -383,12 +410,12 @@ fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, 
     }
 }
 
-/// A path in the midst of being extended by a pixel.
+/// The extension of a path by a pixel.
 struct Step<S: Simd> {
-    /// The least at the pixel before, and with P2 − P1.
+    /// The minimum at the previous pixel, and with P2 − P1 added.
     least: S::u8s,
     jump: S::u8s,
-    /// What the vector before held, the first one of the group, and the last one of the group before.
+    /// Old values of the previous vector, of the first one of the group, and of the last one of the previous group.
     before: S::u8s,
     first: S::u8s,
     last: S::u8s,
@@ -402,7 +429,7 @@ impl<S: Simd> Step<S> {
         Self { least, jump, before: worst, first: worst, last: worst, smallest: worst }
     }
 
-    /// Extends vector `v` of the group at `start`. The vectors before have been replaced, if any were.
+    /// Extends vector `v` of the group at `start`. The previous vectors may have been overwritten.
     #[inline(always)]
     fn extend(
         &mut self,
@@ -431,7 +458,7 @@ impl<S: Simd> Step<S> {
                 if start + group < cost.len() { load(slot, start + group) } else { S::u8s::splat(simd, u8::MAX) };
             self.first.slide::<1>(next)
         };
-        // Never above 255, unlike neighbors beyond the last disparity.
+        // Never above 255, other than those of neighbors in the padding.
         let step = below.min(above).min(self.jump) + p1;
         let cheapest = step.min(here);
         let extended = (cheapest - self.least).saturating_add(load(cost, at));
@@ -441,7 +468,7 @@ impl<S: Simd> Step<S> {
     }
 }
 
-/// `here` moved up by one lane, its first lane from the last of `before`.
+/// Shifts `here` up by one lane; its first lane is the last of `before`.
 #[inline(always)]
 fn up_one<S: Simd>(before: S::u8s, here: S::u8s) -> S::u8s {
     match S::u8s::LEN {

@@ -1,25 +1,25 @@
-//! In which order the disparities of a pixel lie in memory.
+//! Memory layout of the disparities of a pixel.
 //!
-//! They come in groups of 64 or 128, and within a group neighboring disparities lie in neighboring vectors rather than
-//! lanes: of `n` vectors, lane `l` of vector `v` holds disparity `l·n + v`. A path that looks one disparity up and one
-//! down then finds both in vectors it has at hand, and moves lanes only at the two ends of a group.
+//! Disparities are stored in groups of 64 or 128. Within a group, neighboring disparities are in neighboring vectors rather than lanes:
+//! of `n` vectors, lane `l` of vector `v` has disparity `l·n + v`. The disparities one above and one below those of a vector are then
+//! those of the vectors beside it, and lanes are shifted only at the two ends of a group.
 
 use fearless_simd::{Level, dispatch, prelude::*};
 
-/// Disparities come in multiples of so many: a cache line, one to four vectors.
+/// The number of disparities is padded to a multiple of this: a cache line, one to four vectors.
 pub(crate) const BLOCK: usize = 64;
 
-/// Most vectors in a group, those of 16 bytes.
+/// Maximum number of vectors in a group, those of 16 bytes.
 pub(crate) const MAX_VECTORS: usize = 2 * BLOCK / 16;
 
-/// The order for a number of disparities and an instruction set.
+/// The layout for a number of disparities and an instruction set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Layout {
     /// Bytes of a vector.
     pub(crate) lanes: usize,
     /// Disparities per group: one block or two.
     pub(crate) group: usize,
-    /// Disparities with those that only pad.
+    /// Disparities, padding included.
     pub(crate) depth: usize,
 }
 
@@ -30,23 +30,23 @@ impl Layout {
         Self { lanes, group: if blocks.is_multiple_of(2) { 2 * BLOCK } else { BLOCK }, depth: blocks * BLOCK }
     }
 
-    /// Vectors per group.
+    /// Returns the vectors per group.
     pub(crate) fn vectors(&self) -> usize {
         self.group / self.lanes
     }
 
-    /// Number of groups.
+    /// Returns the number of groups.
     pub(crate) fn groups(&self) -> usize {
         self.depth / self.group
     }
 
-    /// Elements of each phase of a row of the right image: element `j` of the mirrored row has phase `j % n`, so that the
-    /// candidates of a pixel for one vector lie side by side.
+    /// Returns the elements of each phase of a row of the right image: element `j` of the mirrored row has phase `j % n`, so that the
+    /// candidates of a pixel for one vector are contiguous.
     pub(crate) fn phase(&self, width: usize) -> usize {
         width / self.vectors() + 1 + self.depth / self.vectors()
     }
 
-    /// Bytes per row and plane of the right image.
+    /// Returns the bytes per row and plane of the right image.
     pub(crate) fn right_row(&self, width: usize) -> usize {
         self.vectors() * self.phase(width)
     }
@@ -57,7 +57,7 @@ fn lanes<S: Simd>(_: S) -> usize {
     S::u8s::LEN
 }
 
-/// Where index `k` lies among the disparities of a pixel.
+/// Returns the position of disparity index `k` in memory.
 #[inline(always)]
 pub(crate) fn place(k: usize, group: usize, lanes: usize) -> usize {
     let n = group / lanes;

@@ -4,7 +4,7 @@
 //! use cv_core::{GrayU8, Silent};
 //! use cv_stereo::{StereoMatcher, StereoOptions};
 //!
-//! // A wall of random bricks five pixels to the left in the right image.
+//! // A wall of random bricks with a disparity of five pixels.
 //! let wall = |shift: usize| {
 //!     GrayU8::from_fn(96, 64, |x, y| [(((x + shift) / 3 * 7919 + y / 4 * 104_729) * 2_654_435 >> 9) as u8])
 //! };
@@ -16,7 +16,7 @@
 //!
 //! # Conventions
 //!
-//! Disparity is `x_left − x_right` in pixels, `f32`, NaN where there is none.
+//! Disparity is `x_left − x_right` in pixels, `f32`, NaN where unknown.
 
 mod aligned_buffer;
 mod census;
@@ -24,16 +24,19 @@ mod coarse_prior;
 mod confidence;
 mod cost;
 mod depth;
+mod disparity_map;
 mod disparity_matcher;
 mod edge_preserving;
 mod error;
 mod evaluate;
 mod expansion_region;
+mod fill_uncertainty;
 mod input;
 mod kernel;
 mod layout;
 mod local_expansion;
 mod matcher;
+mod matcher_memory;
 mod median;
 mod options;
 mod path_sums;
@@ -49,13 +52,15 @@ mod speckle;
 mod surface_filling;
 mod surfaces;
 mod winner;
+mod winner_checks;
 
 pub use depth::{GeometryError, StereoGeometry};
+pub use disparity_map::{DisparityMap, PixelState};
 pub use disparity_matcher::DisparityMatcher;
 pub use error::StereoError;
 pub use evaluate::{BAD_THRESHOLDS, DisparityScores, EvaluateError, evaluate_disparity, non_occluded};
 pub use input::Intensity;
-pub use matcher::{DisparityMap, PixelState, StereoMatcher};
+pub use matcher::StereoMatcher;
 pub use options::{Census, IntensityCost, Paths, Smoothing, StereoOptions, Subpixel};
 #[doc(hidden)]
 pub use path_sums::PathSums;

@@ -1,97 +1,43 @@
-//! From a rectified pair to checked disparities.
+//! The semi-global matcher: from a rectified pair to checked disparities.
 
 use crate::census::{Gray, describe, describe_mirrored, planes};
-use crate::coarse_prior::{Prior, find_flat, guide};
+use crate::coarse_prior::{Prior, classify_texture, set_priors};
 use crate::confidence::{confidence, sigma};
 use crate::cost::{Frame, Penalties};
-use crate::edge_preserving::{self, Planes, smooth};
+use crate::disparity_map::{DisparityMap, PixelState};
+use crate::edge_preserving::{Planes, smooth};
 use crate::input::to_gray;
 use crate::layout::Layout;
 use crate::local_expansion;
+use crate::matcher_memory::STRIP_OVERLAP;
 use crate::sgm::Aggregator;
 use crate::speckle::{Speckles, remove_speckles};
 use crate::surface_filling::{self, Filling, Pair, fill};
-use crate::winner::{NO_SUM, Winner};
-use crate::{Intensity, IntensityCost, Paths, Smoothing, StereoError, StereoOptions, Subpixel, median};
-use cv_core::{Cancelled, GrayF32, Image, ImageView, Progress, Sample, Stage, StageClock};
-use fearless_simd::Level;
+use crate::winner::Winner;
+use crate::winner_checks::check_row;
+use crate::{Intensity, IntensityCost, Paths, Smoothing, StereoError, StereoOptions, median};
+use cv_core::{Cancelled, GrayF32, ImageView, Progress, Stage, StageClock};
+use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Rows beyond a strip that its paths start from: what lies farther away hardly matters.
-const OVERLAP: usize = 32;
+/// An image is not halved below this many px of width or height.
+const MIN_PYRAMID_SIDE: usize = 16;
 
-/// A picture is not halved below so many px of width or height.
-const LEAST_SIDE: usize = 16;
+/// Fewer disparities than this have no pyramid levels: half of them would agree by chance.
+const MIN_PYRAMID_DISPARITIES: usize = 32;
 
-/// Nor for fewer disparities than so many: half of them would agree by chance.
-const LEAST_RANGE: usize = 32;
-/// A coarse level guides where this share of it is matched. Of the 24 public pairs every one has 0.65 or more; photographs of different
-/// things, and exchanged ones, which would be guided to agree with themselves, mostly have less.
-const LEAST_MATCHED: f64 = 0.6;
+/// A coarser level gives priors if this fraction of it is matched. Each of the 24 public pairs has 0.65 or more; images of different
+/// scenes, and exchanged ones, which priors would make consistent with themselves, mostly have less.
+const MIN_PRIOR_MATCHED: f64 = 0.6;
 
-/// Fewer rows than so many at a time would mostly repeat the overlap.
-const MIN_STRIP: usize = 32;
-
-/// How a pixel came by its disparity.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-#[repr(u8)]
-pub enum PixelState {
-    /// Matched and confirmed by every check.
-    #[default]
-    Matched,
-    /// Seen by the left camera only: something nearer hides it from the right one. Filled from the background.
-    Occluded,
-    /// Its match failed a check, or smoothing found it on the wrong side of an outline of the photograph. Filled from the surfaces around.
-    Mismatched,
-    /// Its match would lie outside the right image. Filled from the surfaces around.
-    OutOfView,
-}
-
-impl Sample for PixelState {}
-
-/// Disparities of a left image.
-#[derive(Debug, Clone, PartialEq)]
-pub struct DisparityMap {
-    /// `x_left − x_right` in px, NaN where there is none.
-    pub disparity: GrayF32,
-    /// Where each disparity comes from; all but [`PixelState::Matched`] are filled in, or NaN without filling.
-    pub state: Image<PixelState, 1>,
-}
-
-impl DisparityMap {
-    /// An empty map, to be handed to [`StereoMatcher::compute_into`].
-    pub fn empty() -> Self {
-        Self { disparity: GrayF32::new(0, 0, [0.0]), state: Image::new(0, 0, [PixelState::Matched]) }
-    }
-
-    fn resize(&mut self, width: usize, height: usize) {
-        if self.disparity.size() != (width, height) {
-            self.disparity = GrayF32::new(width, height, [f32::NAN]);
-            self.state = Image::new(width, height, [PixelState::Matched]);
-        }
-    }
-
-    /// Share of pixels with a disparity, filled ones included.
-    pub fn valid_fraction(&self) -> f64 {
-        let d = self.disparity.as_slice();
-        d.iter().filter(|v| v.is_finite()).count() as f64 / d.len().max(1) as f64
-    }
-
-    /// Share of pixels whose disparity was measured and passed every check.
-    pub fn matched_fraction(&self) -> f64 {
-        let s = self.state.as_slice();
-        s.iter().filter(|&&v| v == PixelState::Matched).count() as f64 / s.len().max(1) as f64
-    }
-}
-
-/// A semi-global matcher (Hirschmüller, PAMI 2008) that keeps its buffers between pairs.
+/// A semi-global matcher (Hirschmüller, PAMI 2008) that reuses its buffers between pairs.
 ///
 /// ```
 /// use cv_core::{Image, Silent};
 /// use cv_stereo::{StereoMatcher, StereoOptions};
 ///
-/// // A textured wall seen 5 px further left by the right camera.
+/// // A textured wall with a disparity of 5 px.
 /// let texture = |x: usize, y: usize| ((x * 7919 + y * 104_729 + (x * y) % 97 * 31) % 251) as u8;
 /// let left = Image::<u8, 1>::from_fn(64, 32, |x, y| [texture(x, y)]);
 /// let right = Image::<u8, 1>::from_fn(64, 32, |x, y| [texture(x + 5, y)]);
@@ -106,22 +52,23 @@ pub struct StereoMatcher {
     level: Level,
     gray: [Gray; 2],
     gray8: Vec<u8>,
-    /// Census bits and what the intensity_cost compares, of both views.
+    /// Census bits and values of the intensity cost, of both views.
     described: [Vec<u8>; 2],
     aggregator: Aggregator,
-    /// For aggregation in strips.
+    /// Buffers of the aggregation in strips.
     strip: Aggregator,
     speckles: Speckles,
     filling: Filling,
     scratch: Vec<f32>,
     planes: Planes,
-    /// Where flat pixels are guided to, and the matcher of half the size that says so; none where there is no flat part.
+    /// Priors of low-texture pixels; empty without any.
     priors: Vec<Prior>,
+    /// The matcher at half resolution, which the priors are from.
     coarse: Option<Box<Coarse>>,
     stages: Vec<(&'static str, f64)>,
 }
 
-/// The level of half the size.
+/// The pyramid level of half resolution.
 #[derive(Debug)]
 struct Coarse {
     matcher: StereoMatcher,
@@ -129,7 +76,7 @@ struct Coarse {
 }
 
 impl StereoMatcher {
-    /// A matcher with these options.
+    /// Creates a matcher with these options.
     ///
     /// # Errors
     /// [`StereoError::Range`] and [`StereoError::Option`] for options out of range.
@@ -153,61 +100,15 @@ impl StereoMatcher {
         })
     }
 
-    /// The options.
+    /// Returns the options.
     pub fn options(&self) -> &StereoOptions {
         &self.options
     }
 
-    /// Bytes that matching images of this size takes, outputs included: about one byte per pixel and disparity for the
-    /// sums, and seventy per pixel, in quality mode a hundred more (gray values 6, bits 3 to 8 of each view, winners 12, labels up to 8, priors 4, surfaces 7, the planes of the
-    /// smoothing 16, outputs and scratch 9), and for the coarser levels an eighth of the sums and a third of the rest. Under [`StereoOptions::max_memory`] the sums are those of a strip.
-    pub fn memory(&self, width: usize, height: usize) -> usize {
-        let coarse = self.coarse_memory(width, height);
-        let rows = self.strip_rows(width, height, coarse).unwrap_or(height);
-        self.memory_of(width, height, rows, coarse)
-    }
-
-    /// Bytes of the coarser levels.
-    fn coarse_memory(&self, width: usize, height: usize) -> usize {
-        self.coarser(width, height).map_or(0, |(_, bytes)| bytes)
-    }
-
-    /// Bytes where `rows` rows at a time are aggregated and the coarser levels take `coarse`.
-    fn memory_of(&self, width: usize, height: usize, rows: usize, coarse: usize) -> usize {
-        let options = &self.options;
-        let pixels = width.saturating_mul(height);
-        let planes = planes(options.census, options.intensity_cost);
-        let strip = if rows < height { (rows + 2 * OVERLAP).min(height) } else { 0 };
-        let whole = if rows < height { 0 } else { height };
-        // Gray of both views in 16 bits, of one in 8; winners of both views; labels, scratch and outputs.
-        let fixed = 5 + planes + size_of::<Winner>() + size_of::<u16>() + 8 + 4 + 5 + size_of::<Prior>();
-        let stride = self.layout().right_row(width);
-        Aggregator::bytes(width, strip.max(whole), self.layout())
-            .saturating_add(strip.saturating_mul(width).saturating_mul(size_of::<Winner>() + size_of::<u16>()))
-            .saturating_add(pixels.saturating_mul(fixed))
-            .saturating_add(edge_preserving::bytes(options.smoothing, width, height))
-            .saturating_add(if options.fill || options.quality { surface_filling::bytes(width, height) } else { 0 })
-            .saturating_add(if options.quality { local_expansion::bytes(width, height) } else { 0 })
-            .saturating_add(coarse)
-            .saturating_add(stride.saturating_mul(height).saturating_mul(planes))
-    }
-
-    /// How many rows at a time are aggregated under [`StereoOptions::max_memory`]: `None` for all, or where not even few
-    /// would do.
-    fn strip_rows(&self, width: usize, height: usize, coarse: usize) -> Option<usize> {
-        let allowed = self.options.max_memory?;
-        if self.memory_of(width, height, height, coarse) <= allowed {
-            return None;
-        }
-        // The more rows, the less is done twice.
-        let fits = |rows: &usize| self.memory_of(width, height, *rows, coarse) <= allowed;
-        (MIN_STRIP..height).step_by(MIN_STRIP).take_while(fits).last()
-    }
-
-    /// Disparities of `left`. The images are rectified: a scene point has the same y in both.
+    /// Computes the disparities of `left`. The images are rectified: a scene point has the same y in both.
     ///
     /// # Errors
-    /// [`StereoError`] where the images do not fit together or the disparities do not fit the images, and where `progress` says stop.
+    /// [`StereoError`] if the images differ in size, the disparities do not fit the images, or `progress` returns stop.
     pub fn compute<T: Intensity, const C: usize>(
         &mut self,
         left: ImageView<'_, T, C>,
@@ -219,10 +120,10 @@ impl StereoMatcher {
         Ok(map)
     }
 
-    /// As [`StereoMatcher::compute`], into a map of any size, whose memory is used again where it has the right one.
+    /// As [`StereoMatcher::compute`], into a map of any size; its memory is reused if it has the right size.
     ///
     /// # Errors
-    /// As [`StereoMatcher::compute`]; `map` is then unchanged, or, where the job was stopped, of no use.
+    /// As [`StereoMatcher::compute`]; `map` is then unchanged, or, if the job was stopped, unspecified.
     pub fn compute_into<T: Intensity, const C: usize>(
         &mut self,
         left: ImageView<'_, T, C>,
@@ -246,7 +147,7 @@ impl StereoMatcher {
         self.compute_gray(map, clock, progress)
     }
 
-    /// As [`StereoMatcher::compute_into`], of the gray values at hand.
+    /// As [`StereoMatcher::compute_into`], of the gray levels in `self.gray`.
     fn compute_gray(
         &mut self,
         map: &mut DisparityMap,
@@ -255,7 +156,7 @@ impl StereoMatcher {
     ) -> Result<(), StereoError> {
         let (width, height) = (self.gray[0].width, self.gray[0].height);
         progress.report("bits", 0, 1)?;
-        self.bits();
+        self.describe_pixels();
         clock.lap("bits");
         self.match_coarse(width, height, progress)?;
         clock.lap("coarse");
@@ -270,23 +171,32 @@ impl StereoMatcher {
         Ok(())
     }
 
-    /// What the last pair took in seconds, stage by stage: gray values, description of the pixels, costs and path sums,
+    /// Returns the stages of the last pair and their seconds: gray levels, census bits, coarser levels, costs and aggregation,
     /// checks and refinement.
     pub fn stages(&self) -> &[(&'static str, f64)] {
         &self.stages
     }
 
-    /// How sure each disparity of the last pair is, 0 to 1: how far its cost lies below the best one elsewhere; 0 where it
-    /// was filled. `None` without [`StereoOptions::confidence`], and before the first pair.
+    /// Returns the confidence of each disparity of the last pair, 0 to 1: the naive peak ratio of its cost and the best one elsewhere;
+    /// 0 for filled pixels. `None` without [`StereoOptions::confidence`], and before the first pair.
     pub fn confidence(&self, map: &DisparityMap) -> Option<GrayF32> {
         let known = self.options.confidence && self.aggregator.winners.len() == map.state.as_slice().len();
         known.then(|| self.per_pixel(map, confidence))
     }
 
-    /// Standard deviation in px of each disparity of the last pair, from how sharp its minimum is; NaN where it was
-    /// filled. [`crate::StereoGeometry::depth_uncertainty`] makes error bars of depth from it.
+    /// Returns the standard deviation in px of each disparity of the last pair: of matched pixels from the sharpness of the minimum, of
+    /// filled ones from how far their surface was extrapolated; NaN where there is no disparity.
+    /// [`crate::StereoGeometry::depth_uncertainty`] converts it to depth.
     pub fn uncertainty(&self, map: &DisparityMap) -> GrayF32 {
-        self.per_pixel(map, sigma)
+        let width = map.state.width();
+        let mut deviations = self.per_pixel(map, sigma);
+        let pixels = deviations.as_mut_slice().iter_mut().zip(map.state.as_slice()).zip(map.disparity.as_slice());
+        for (i, ((deviation, &state), d)) in pixels.enumerate() {
+            if state != PixelState::Matched && !d.is_nan() {
+                *deviation = self.filling.sigma(i % width, i / width, width, state);
+            }
+        }
+        deviations
     }
 
     fn per_pixel(&self, map: &DisparityMap, f: impl Fn(&Winner, PixelState) -> f32) -> GrayF32 {
@@ -295,61 +205,26 @@ impl StereoMatcher {
         GrayF32::from_vec(width, height, values.collect()).unwrap_or_else(|_| GrayF32::new(0, 0, [0.0]))
     }
 
-    /// Refuses image sizes that these options cannot work on.
-    fn check_size(&self, width: usize, height: usize) -> Result<(), StereoError> {
-        self.check_memory(width, height, self.memory(width, height))
-    }
-
-    /// As `check_size`, where `bytes` are what these images take.
-    fn check_memory(&self, width: usize, height: usize, bytes: usize) -> Result<(), StereoError> {
-        let (window_width, window_height) = self.options.census.size();
-        if width < window_width || height < window_height {
-            return Err(StereoError::TooSmall { width, height, window_width, window_height });
-        }
-        let min = i64::from(self.options.min_disparity);
-        let max = min + self.options.disparities as i64 - 1;
-        if min >= width as i64 || max <= -(width as i64) {
-            return Err(StereoError::RangeOutsideImage { min, max, width });
-        }
-        let allowed = self.options.max_memory.unwrap_or(isize::MAX as usize);
-        if bytes > allowed {
-            let coarse = self.coarse_memory(width, height);
-            let of = |rows| self.memory_of(width, height, rows, coarse);
-            let needed = of(MIN_STRIP).min(of(height));
-            return Err(StereoError::Memory { needed, allowed });
-        }
-        Ok(())
-    }
-
-    /// Asks for the memory that images of this size need, so that the first frame takes no longer than the next.
-    ///
-    /// # Errors
-    /// [`StereoError`] where the disparities do not fit the images, or the memory is more than allowed.
-    pub fn prepare(
+    /// Allocates the sums of images of this size, or of a strip of them.
+    pub(crate) fn prepare_aggregation(
         &mut self,
         width: usize,
         height: usize,
-        map: &mut DisparityMap,
         progress: &dyn Progress,
-    ) -> Result<(), StereoError> {
-        self.check_size(width, height)?;
+    ) -> Result<(), Cancelled> {
         match self.strip_rows(width, height, self.coarse_memory(width, height)) {
-            None => self.aggregator.prepare(width, height, self.layout(), progress)?,
-            Some(rows) => {
-                self.strip.prepare(width, (rows + 2 * OVERLAP).min(height), self.layout(), progress)?;
-            }
+            None => self.aggregator.prepare(width, height, self.layout(), progress),
+            Some(rows) => self.strip.prepare(width, (rows + 2 * STRIP_OVERLAP).min(height), self.layout(), progress),
         }
-        map.resize(width, height);
-        Ok(())
     }
 
-    /// In which order the disparities of a pixel lie in memory.
-    fn layout(&self) -> Layout {
+    /// Returns the memory layout of the disparities of a pixel.
+    pub(crate) fn layout(&self) -> Layout {
         Layout::new(self.level, self.options.disparities)
     }
 
-    /// What costs are made of.
-    fn bits(&mut self) {
+    /// Computes census bits, values of the intensity cost and 8-bit gray levels.
+    fn describe_pixels(&mut self) {
         let (level, layout) = (self.level, self.layout());
         let StereoOptions { census, intensity_cost, min_disparity, .. } = self.options;
         let [left, right] = &mut self.described;
@@ -358,10 +233,10 @@ impl StereoMatcher {
         self.gray[0].to_bytes(&mut self.gray8);
     }
 
-    /// A matcher of half the size and its bytes, where there is to be one and it has the memory.
-    fn coarser(&self, width: usize, height: usize) -> Option<(Self, usize)> {
+    /// Returns a matcher for half resolution and its bytes; `None` without a further level, and where the memory limit excludes it.
+    pub(crate) fn coarser(&self, width: usize, height: usize) -> Option<(Self, usize)> {
         let StereoOptions { min_disparity, disparities, pyramid_levels, max_memory, .. } = self.options;
-        if pyramid_levels == 0 || width.min(height) < 2 * LEAST_SIDE || disparities < LEAST_RANGE {
+        if pyramid_levels == 0 || width.min(height) < 2 * MIN_PYRAMID_SIDE || disparities < MIN_PYRAMID_DISPARITIES {
             return None;
         }
         let first = min_disparity.div_euclid(2);
@@ -385,14 +260,15 @@ impl StereoMatcher {
         coarse.check_memory(width / 2, height / 2, bytes).is_ok().then_some((coarse, bytes))
     }
 
-    /// Matches at half the size where the photograph is flat, for `priors`.
+    /// Matches at half resolution if enough of the image has low texture, and sets `priors`.
     fn match_coarse(&mut self, width: usize, height: usize, progress: &dyn Progress) -> Result<(), StereoError> {
         let coarse = self.coarser(width, height);
-        let Some((new, _)) = coarse.filter(|_| find_flat(self.level, &self.gray8, width, &mut self.priors)) else {
+        let Some((new, _)) = coarse.filter(|_| classify_texture(self.level, &self.gray8, width, &mut self.priors))
+        else {
             self.priors.clear();
             return Ok(());
         };
-        // Made anew where the size of the pictures leaves it other options.
+        // Replaced if the image size gives it other options.
         let coarse = self.coarse.take().filter(|coarse| coarse.matcher.options == new.options);
         let mut coarse = coarse.unwrap_or_else(|| Box::new(Coarse { matcher: new, map: DisparityMap::empty() }));
         let Coarse { matcher, map } = &mut *coarse;
@@ -400,17 +276,17 @@ impl StereoMatcher {
             small.halve(large);
         }
         matcher.compute_gray(map, StageClock::new(), progress)?;
-        if map.matched_fraction() < LEAST_MATCHED {
+        if map.matched_fraction() < MIN_PRIOR_MATCHED {
             self.priors.clear();
         } else {
             let range = (self.options.min_disparity, self.options.disparities);
-            guide(self.level, map.disparity.as_slice(), width / 2, width, range, &mut self.priors);
+            set_priors(self.level, map.disparity.as_slice(), width / 2, width, range, &mut self.priors);
         }
         self.coarse = Some(coarse);
         Ok(())
     }
 
-    /// Costs and path sums; winners of both views.
+    /// Aggregates the costs and selects the winners of both views.
     fn aggregate(&mut self, width: usize, height: usize, progress: &dyn Progress) -> Result<(), Cancelled> {
         let options = &self.options;
         let layout = self.layout();
@@ -419,8 +295,8 @@ impl StereoMatcher {
         let p2 = Penalties::new(options);
         let rows = self.strip_rows(width, height, self.coarse_memory(width, height));
         let strips = rows.map_or(1, |rows| height.div_ceil(rows));
-        // Each row twice, and some more where strips overlap.
-        let stage = Stage::new(progress, "aggregate", 2 * (height + 2 * OVERLAP * (strips - 1)))?;
+        // Each row twice, and the overlap of strips.
+        let stage = Stage::new(progress, "aggregate", 2 * (height + 2 * STRIP_OVERLAP * (strips - 1)))?;
         let run = |aggregator: &mut Aggregator, rows: Range<usize>| -> Result<(), Cancelled> {
             let frame = Frame {
                 width,
@@ -447,8 +323,8 @@ impl StereoMatcher {
         right.resize(width * height, 0);
         for start in (0..height).step_by(rows) {
             let end = (start + rows).min(height);
-            let from = start.saturating_sub(OVERLAP);
-            run(&mut self.strip, from..(end + OVERLAP).min(height))?;
+            let from = start.saturating_sub(STRIP_OVERLAP);
+            run(&mut self.strip, from..(end + STRIP_OVERLAP).min(height))?;
             let inside = (start - from) * width..(end - from) * width;
             winners[start * width..end * width].copy_from_slice(&self.strip.winners[inside.clone()]);
             right[start * width..end * width].copy_from_slice(&self.strip.right[inside]);
@@ -456,28 +332,21 @@ impl StereoMatcher {
         Ok(())
     }
 
-    /// Uniqueness, view, left-right consistency; sub-pixel place of what passes.
+    /// Checks the winners (uniqueness, field of view, left-right consistency) and refines those that pass to sub-pixel accuracy.
     fn check(&self, map: &mut DisparityMap) {
         let width = map.disparity.width();
         let Aggregator { winners, right, .. } = &self.aggregator;
-        let options = &self.options;
         map.disparity
             .as_mut_slice()
             .par_chunks_mut(width)
             .zip(map.state.as_mut_slice().par_chunks_mut(width))
             .zip(winners.par_chunks(width).zip(right.par_chunks(width)))
             .for_each(|((disparity, state), (winners, right))| {
-                for (x, ((winner, state), d)) in winners.iter().zip(state).zip(disparity).enumerate() {
-                    *state = judge(options, x, winner, right);
-                    let whole = (options.min_disparity + i32::from(winner.index)) as f32;
-                    // Computed in any case: a branch would be guessed wrong where matched and lost pixels mix.
-                    let value = whole + subpixel(options.subpixel, winner);
-                    *d = if *state == PixelState::Matched { value } else { f32::NAN };
-                }
+                dispatch!(self.level, simd => check_row(simd, &self.options, winners, right, state, disparity));
             });
     }
 
-    /// Speckles, holes, median.
+    /// Removes speckles, fills holes, and smooths; in quality mode improves the map by local expansion moves.
     fn refine(&mut self, map: &mut DisparityMap, progress: &dyn Progress) -> Result<(), Cancelled> {
         let stage = Stage::new(progress, "refine", 4)?;
         let width = map.disparity.width();
@@ -509,13 +378,13 @@ impl StereoMatcher {
         }
         smooth(self.level, options.smoothing, disparity, states, &self.gray8, width, &mut self.planes, &stage)?;
         stage.add(1)?;
-        // Where nothing at all was matched there is nothing to improve.
+        // Without any match there is nothing to improve.
         if options.quality && disparity.iter().all(|d| d.is_finite()) {
             let first = options.min_disparity as f32;
             let range = (first, first + (options.disparities - 1) as f32);
             let gray = [&self.gray[0], &self.gray[1]];
             local_expansion::expand(self.level, gray, range, disparity, states, progress)?;
-            surface_filling::name_causes(disparity, states, width, &mut self.filling);
+            surface_filling::classify_unmatched(disparity, states, width, &mut self.filling);
         }
         if options.quality && !options.fill {
             let unknown = disparity.iter_mut().zip(states).filter(|(_, state)| **state != PixelState::Matched);
@@ -525,49 +394,13 @@ impl StereoMatcher {
     }
 }
 
-/// What the checks say of a pixel's winner. Without branches on what pixels hold: they would be guessed wrong where matched and
-/// lost pixels mix.
-#[inline(always)]
-fn judge(options: &StereoOptions, x: usize, winner: &Winner, right: &[u16]) -> PixelState {
-    let xr = x as i64 - i64::from(options.min_disparity) - i64::from(winner.index);
-    let inside = xr >= 0 && xr < right.len() as i64;
-    let seen = right[xr.clamp(0, right.len() as i64 - 1) as usize];
-    let differs = options.left_right.is_some_and(|tolerance| seen.abs_diff(winner.index) > tolerance);
-    // Nothing tells one disparity from the next, nor what hides the pixel.
-    let flat = winner.below == winner.cost;
-    let unsure = u32::from(winner.second) * u32::from(100 - options.uniqueness) < u32::from(winner.cost) * 100;
-    let unsure = flat | (unsure & (options.uniqueness > 0));
-    let mut state = if unsure { PixelState::Mismatched } else { PixelState::Matched };
-    // What the right camera sees there is nearer: it hides this pixel.
-    let hidden = if seen > winner.index { PixelState::Occluded } else { PixelState::Mismatched };
-    state = if differs { hidden } else { state };
-    state = if inside { state } else { PixelState::OutOfView };
-    if flat { PixelState::Mismatched } else { state }
-}
-
-/// Offset of the minimum from the winning index, −0.5 to 0.5; without branches on sums, as above.
-#[inline(always)]
-fn subpixel(method: Subpixel, winner: &Winner) -> f32 {
-    let [below, above, cost] = [winner.below, winner.above, winner.cost].map(f32::from);
-    let slope = below.max(above) - cost;
-    // Rise on the lower side as a share of that on the higher: 1 in the middle, 0 half a pixel away.
-    let ratio = (below.min(above) - cost) / slope;
-    let rest = match method {
-        Subpixel::CorrectedVFit => 0.5 * ratio * (1.0 + ratio),
-        Subpixel::None | Subpixel::VFit => ratio,
-    };
-    let offset = (0.5 * (1.0 - rest)).copysign(below - above);
-    let none = (method == Subpixel::None) | (winner.below == NO_SUM) | (winner.above == NO_SUM) | (slope <= 0.0);
-    if none { 0.0 } else { offset }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use cv_core::{GrayU8, Silent};
     use cv_synth::instruction_sets;
 
-    /// A textured slope before a textured wall, with a patch without texture.
+    /// A textured slanted surface in front of a textured wall, with a textureless patch.
     fn pair() -> [GrayU8; 2] {
         let noise = |x: usize, y: usize| (x * 7919 + y * 104_729 + x * y % 97 * 31).wrapping_mul(2_654_435_761) >> 13;
         [0, 1].map(|right| {
@@ -604,7 +437,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_of_one_color_matches_nowhere() {
+    fn an_image_of_one_color_matches_nowhere() {
         let gray = GrayU8::new(60, 40, [77]);
         let mut matcher = StereoMatcher::new(StereoOptions { disparities: 24, ..Default::default() }).unwrap();
         let map = matcher.compute(gray.view(), gray.view(), &Silent).unwrap();

@@ -1,11 +1,11 @@
-//! A median filter that knows holes.
+//! Median filter of maps with holes.
 
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
 
-/// Median of the valid values in the window of `radius` (1 or 2) around every valid pixel, the lower one of an even
-/// count; holes stay holes. Beyond the border there are no values.
+/// Computes the median of the valid values in the window of `radius` (1 or 2) around every valid pixel, the lower one of an even
+/// count; holes stay holes. Windows are cut at the image border.
 pub(crate) fn median(level: Level, disparity: &[f32], width: usize, radius: usize, out: &mut Vec<f32>) {
     out.resize(disparity.len(), f32::NAN);
     if width == 0 || disparity.is_empty() {
@@ -25,7 +25,7 @@ pub(crate) fn median(level: Level, disparity: &[f32], width: usize, radius: usiz
     });
 }
 
-/// The definition.
+/// Computes the median at a pixel by sorting.
 fn median_at(disparity: &[f32], width: usize, height: usize, radius: usize, x: usize, y: usize) -> f32 {
     let center = disparity[y * width + x];
     if center.is_nan() {
@@ -44,14 +44,14 @@ fn median_at(disparity: &[f32], width: usize, height: usize, radius: usize, x: u
     *window[..n].select_nth_unstable_by((n - 1) / 2, f32::total_cmp).1
 }
 
-/// Exchanges of vectors, written out: a loop over a table of indices would keep the vectors in memory.
+/// Compare-exchange steps of a sorting network, unrolled: a loop over a table of indices would keep the vectors in memory.
 macro_rules! exchange {
     ($v:ident: $($i:literal $j:literal),*) => {
         $(($v[$i], $v[$j]) = ($v[$i].min($v[$j]), $v[$i].max($v[$j]));)*
     };
 }
 
-/// The median of nine (Devillard, "Fast median search", 1998).
+/// Returns the median of nine (Devillard, "Fast median search", 1998).
 #[inline(always)]
 #[rustfmt::skip]
 fn of_nine<S: Simd>(mut v: [S::f32s; 9]) -> S::f32s {
@@ -62,7 +62,7 @@ fn of_nine<S: Simd>(mut v: [S::f32s; 9]) -> S::f32s {
     v[4]
 }
 
-/// The median of twenty-five (likewise).
+/// Returns the median of twenty-five (same source).
 #[inline(always)]
 #[rustfmt::skip]
 fn of_twenty_five<S: Simd>(mut v: [S::f32s; 25]) -> S::f32s {
@@ -78,7 +78,8 @@ fn of_twenty_five<S: Simd>(mut v: [S::f32s; 25]) -> S::f32s {
     v[12]
 }
 
-/// Medians of the columns `radius` to `width − 1 − radius` of the middle one of `2 radius + 1` rows; false where they are narrower than a vector.
+/// Computes the medians of columns `radius` to `width − 1 − radius` of the middle one of `2 radius + 1` rows; returns false if they are
+/// narrower than a vector.
 #[simd]
 fn median_row<S: Simd>(simd: S, rows: &[f32], width: usize, radius: usize, out: &mut [f32]) -> bool {
     if radius == 1 {
@@ -115,7 +116,7 @@ fn windows<S: Simd, const N: usize>(
         }
         let center = v[N / 2].is_nan();
         if sum.is_nan().any_true() {
-            // Of the holes of a window one is put first, the next one last, and so on: the lower median of the others is then in the middle.
+            // Holes become −∞ and +∞ in turn: the median of the window is then the lower median of the valid values.
             let mut end = S::f32s::splat(simd, f32::NEG_INFINITY);
             for value in &mut v {
                 let hole = value.is_nan();

@@ -1,26 +1,26 @@
-//! What a caller can choose.
+//! Options of the stereo matcher.
 
 use crate::StereoError;
 use crate::coarse_prior::PRIOR_CAP;
 use cv_core::OptionError;
 
-/// The neighborhood a pixel is described by: one bit per neighbor, set where it is darker than the center.
+/// The census window: one bit per neighbor, set if it is darker than the center.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Census {
-    /// 5×5, 24 bits: finest detail, least support in weak texture.
+    /// 5×5, 24 bits: finest detail, least support in low texture.
     Window5x5,
     /// 7×7, 48 bits.
     Window7x7,
-    /// 9×7, 62 bits: steadiest under noise, rounds off thin structures.
+    /// 9×7, 62 bits: most robust to noise, loses thin structures.
     Window9x7,
 }
 
 cv_core::named!(Census { Window5x5 = "5": "5×5", Window7x7 = "7": "7×7", Window9x7 = "9": "9×7" });
 
 impl Census {
-    /// Width and height of the window.
+    /// Returns the width and height of the window.
     pub fn size(self) -> (usize, usize) {
         match self {
             Self::Window5x5 => (5, 5),
@@ -29,46 +29,46 @@ impl Census {
         }
     }
 
-    /// Number of neighbors compared.
+    /// Returns the number of neighbors compared.
     pub fn bits(self) -> usize {
         let (w, h) = self.size();
         w * h - 1
     }
 }
 
-/// What is added to the number of census bits in which two pixels differ, from the two pixels alone: sharper at the
-/// outlines of things than a window, but not indifferent to exposure.
+/// A cost of the two pixels alone, added to the Hamming distance of their census bits: sharper at depth discontinuities than a window, but
+/// not invariant to exposure.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum IntensityCost {
     /// Nothing.
     None,
-    /// The absolute difference of their gray values (AD-Census; Mei et al., ICCV workshops 2011).
+    /// The absolute difference of their gray levels (AD-Census; Mei et al., ICCV workshops 2011).
     Gray {
-        /// Gray levels (of 255) that count as one bit; 1 or more.
+        /// Gray levels (of 255) that cost one bit; 1 or more.
         per_bit: u8,
-        /// The most that is added.
+        /// Maximum of the cost, in bits.
         cap: u8,
     },
-    /// The absolute difference of their horizontal gradients, which a change of exposure only scales.
+    /// The absolute difference of their horizontal gradients, which are invariant to an intensity offset.
     Gradient {
-        /// Gray levels per pixel (of 255) that count as one bit; 1 or more.
+        /// Gray levels per pixel (of 255) that cost one bit; 1 or more.
         per_bit: u8,
-        /// The most that is added.
+        /// Maximum of the cost, in bits.
         cap: u8,
     },
 }
 
-// Of the weights tried on rendered scenes and photographs, those that gave the fewest errors.
+// The weights with the fewest errors on rendered scenes and public pairs.
 cv_core::named!(IntensityCost {
     None = "none",
-    Gray { per_bit: 2, cap: 8 } = "gray" | "grey": "the absolute difference of gray values",
+    Gray { per_bit: 2, cap: 8 } = "gray" | "grey": "the absolute difference of gray levels",
     Gradient { per_bit: 1, cap: 6 } = "gradient": "that of horizontal gradients",
 });
 
 impl IntensityCost {
-    /// The most that is added.
+    /// Returns the maximum of the cost, in bits.
     pub fn cap(self) -> u8 {
         match self {
             Self::None => 0,
@@ -77,123 +77,119 @@ impl IntensityCost {
     }
 }
 
-/// Along how many directions costs are aggregated.
+/// Number of aggregation paths.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Paths {
-    /// Horizontal and vertical, both ways: half the sums, 0.85 of the time, slightly streaky on slanted surfaces.
+    /// Horizontal and vertical, both ways: half the sums, 0.85 of the time, slight streaks on slanted surfaces.
     Four,
-    /// And both diagonals, both ways.
+    /// Also both diagonals, both ways.
     Eight,
 }
 
-cv_core::named!(Paths { Four = "4": "0.85 of the time, slightly streaky on slanted surfaces", Eight = "8" });
+cv_core::named!(Paths { Four = "4": "0.85 of the time, slight streaks on slanted surfaces", Eight = "8" });
 
-/// How the disparity is placed between whole pixels.
+/// Sub-pixel refinement of the disparity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Subpixel {
     /// Whole pixels.
     None,
-    /// Two lines of equal slope through the aggregated costs around the minimum (equiangular fit).
+    /// Equiangular fit: two lines of equal slope through the aggregated costs around the minimum.
     VFit,
-    /// The same, corrected for the shape that aggregated census costs have: they rise less than in proportion to the
-    /// distance, so that the plain fit draws disparities to whole pixels. The correction was measured on rendered
-    /// slanted planes, over which the fractions come out even.
+    /// The equiangular fit corrected for pixel locking: aggregated census costs rise less than in proportion to the distance, which biases
+    /// the plain fit to whole pixels. The correction was measured on rendered slanted planes, where the fractions become uniform.
     CorrectedVFit,
 }
 
-/// How disparities are smoothed along surfaces, with the left photograph as the guide.
+/// Edge-preserving smoothing of the disparities, guided by the left image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Smoothing {
-    /// Not at all.
+    /// No smoothing.
     None,
-    /// Outlines move to the edges of the photograph, and pixels of a surface are averaged over 9×9 px.
+    /// Depth discontinuities move to image edges, and each surface is averaged over 9×9 px.
     Bilateral {
-        /// Gray levels (of 255) between pixels at which they have no more to say to each other; positive. Default 24: on
-        /// sixteen generated scenes of four kinds (rooms, tables, balls, posters; seeds 100 to 103, both cameras with noise,
-        /// half at one stop less) 16 to 32 leave 1.64 % of errors above 1 px, 8 leaves 1.71 and 56 leaves 1.66.
+        /// Difference in gray levels (of 255) at which the weight of a pixel becomes 0; positive. Default 24: on sixteen generated scenes
+        /// of four kinds (rooms, tables, balls, posters; seeds 100 to 103, both cameras with noise, half at one stop less) 16 to 32
+        /// leave 1.64 % of errors above 1 px, 8 leaves 1.71 and 56 leaves 1.66.
         sigma: f32,
     },
-    /// Weighted least squares (Min et al., TIP 2014), as in OpenCV's `DisparityWLSFilter`: reaches farther, takes longer.
+    /// Weighted least squares (Min et al., TIP 2014), as in OpenCV's `DisparityWLSFilter`: larger support, slower.
     LeastSquares {
-        /// How smooth; positive. OpenCV's default is 8000.
+        /// Weight of the smoothness term; positive. OpenCV's default is 8000.
         lambda: f32,
-        /// Gray levels (of 255) between neighbors at which smoothing has fallen to 1/e; positive. OpenCV's default is
-        /// 1.5.
+        /// Difference in gray levels (of 255) of neighbors at which smoothing has decreased to 1/e; positive. OpenCV's default is 1.5.
         sigma: f32,
     },
 }
 
 cv_core::named!(Smoothing {
     None = "none",
-    Bilateral { sigma: 24.0 } = "bilateral": "outlines at the edges of the photograph",
-    LeastSquares { lambda: 100.0, sigma: 1.5 } = "wls": "weighted least squares: reaches farther, takes longer",
+    Bilateral { sigma: 24.0 } = "bilateral": "depth discontinuities at image edges",
+    LeastSquares { lambda: 100.0, sigma: 1.5 } = "wls": "weighted least squares: larger support, slower",
 });
 
-/// Options of [`crate::StereoMatcher`]. Costs count census bits.
+/// Options of [`crate::StereoMatcher`]. The unit of costs is a census bit.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct StereoOptions {
     /// Smallest disparity in px; may be negative. Default 0 (points at infinity of a rectified pair).
     pub min_disparity: i32,
-    /// Number of whole disparities tried, from `min_disparity` up; 1 to 4096, any number. Default 128.
+    /// Number of whole disparities of the search range, from `min_disparity` up; 1 to 4096. Default 128.
     pub disparities: usize,
-    /// Matching window. Default 5×5.
+    /// Census window. Default 5×5.
     pub census: Census,
-    /// What is added to the differing bits. Default nothing.
+    /// Cost added to the Hamming distance. Default none.
     pub intensity_cost: IntensityCost,
-    /// Penalty for a disparity step of one pixel between neighbors. Default 4 (Pandora's default for census 5×5).
+    /// Penalty for a disparity step of 1 px between neighbors. Default 4 (Pandora's for census 5×5).
     pub p1: u8,
-    /// Penalty for a larger step where the image is smooth. Default 24, where Pandora has 20: on roads more is a little better (9.1 % of the pixels
-    /// wrong by more than 2 px with 20, 8.7 with 24), on generated rooms less; indoors 20 to 40 differ by 0.3 points.
+    /// Penalty for a larger step where the image has no edge. Default 24 (Pandora: 20): on roads 9.1 % of the errors are above 2 px with 20,
+    /// 8.7 % with 24; generated rooms prefer less; indoors 20 to 40 differ by 0.3 points.
     pub p2: u8,
-    /// What `p2` falls to across a strong edge of the image. Default 4: that and
-    /// `p2_gradient` left the fewest errors of twelve settings on generated scenes (rooms, tables, a ball and a poster wall, seeds
-    /// 300 to 305, half of them at one stop less).
+    /// Minimum of `p2`, at strong image edges. Default 4: with `p2_gradient` 8 the fewest errors of twelve settings on generated scenes
+    /// (rooms, tables, a ball and a poster wall, seeds 300 to 305, half of them at one stop less).
     pub p2_min: u8,
-    /// Gray levels (of 255) between neighbors at which `p2` has fallen half way to `p2_min`; 0 keeps `p2` everywhere.
+    /// Difference in gray levels (of 255) of neighbors at which `p2` has decreased half way to `p2_min`; 0 keeps `p2` everywhere.
     /// Default 8.
     pub p2_gradient: u8,
-    /// Levels of half the size each that guide pixels in flat surroundings; 0 for none. Default 2. Together they take a quarter of the
-    /// time, more where there are 64 disparities and fewer, and none where hardly anything is flat.
+    /// Coarser pyramid levels, which give priors to pixels of low texture; 0 for none. Default 2. They take a quarter of the time, more for
+    /// 64 and fewer disparities, and none in images without low texture.
     pub pyramid_levels: u8,
-    /// Directions of aggregation. Default eight.
+    /// Aggregation paths. Default eight.
     pub paths: Paths,
-    /// A winner must be at least this many percent cheaper than any disparity not next to it; 0 to 99, 0 accepts all.
-    /// Default 0: the left-right check finds the same errors and loses fewer good pixels.
+    /// Uniqueness ratio: percent by which a winner must be cheaper than any disparity not next to it; 0 to 99, 0 accepts all. Default 0: the
+    /// left-right check finds the same errors and rejects fewer correct pixels.
     pub uniqueness: u8,
-    /// Largest difference in px between the disparities seen from left and from right; `None` skips the check.
-    /// Default 1 (OpenCV's `disp12MaxDiff` in its samples).
+    /// Left-right consistency: maximum difference in px of the disparities of both views; `None` skips the check. Default 1 (OpenCV's
+    /// `disp12MaxDiff` in its samples).
     pub left_right: Option<u16>,
-    /// Connected patches of up to this many pixels are removed; 0 removes none. Default 100 (OpenCV's samples).
+    /// Speckle filter: connected components of up to this many pixels are removed; 0 removes none. Default 100 (OpenCV's samples).
     pub speckle_size: usize,
-    /// Neighbors that differ by no more than this many px belong to one patch. Default 2.
+    /// Maximum difference in px of neighbors in a component of the speckle filter. Default 2.
     pub speckle_range: f32,
-    /// Sub-pixel placement. Default [`Subpixel::CorrectedVFit`].
+    /// Sub-pixel refinement. Default [`Subpixel::CorrectedVFit`].
     pub subpixel: Subpixel,
     /// Radius in px of the median filter; 0 for none, 1 or 2. Default 1 (3×3).
     pub median: usize,
-    /// Edge-preserving smoothing, last of all. Default [`Smoothing::Bilateral`] of 24 gray levels: on rendered scenes and
-    /// on photographs, errors above 1 px fall by a tenth.
+    /// Edge-preserving smoothing, the last stage. Default [`Smoothing::Bilateral`] of 24 gray levels: a tenth fewer errors above 1 px on
+    /// rendered scenes and public pairs.
     pub smoothing: Smoothing,
-    /// Whether rejected pixels get a disparity from their surroundings (background side where occluded, the plane of
-    /// what is around a large hole where that lies on one). They are told apart by [`crate::PixelState`]. Default true.
+    /// Whether rejected pixels are filled from the surrounding surfaces, as [`crate::PixelState`] says by which cause. Default true.
     pub fill: bool,
-    /// Quality mode: the map is improved by local expansion moves over slanted planes (Taniai et al., PAMI 2018), which takes about fifty times as long (8 to 14 µs of
-    /// one core a pixel) and leaves two thirds of the errors above 2 px (Middlebury 2014, quarter size), on roads half. Default false.
+    /// Quality mode: local expansion moves over slanted planes (Taniai et al., PAMI 2018) after semi-global matching. Takes about fifty times
+    /// as long (8 to 14 µs of one core per pixel) and leaves two thirds of the errors above 2 px (Middlebury 2014, quarter size), on roads
+    /// half. Default false.
     pub quality: bool,
-    /// Whether [`crate::StereoMatcher::confidence`] is wanted: finding the second best match takes a tenth of the time.
-    /// Default false.
+    /// Whether [`crate::StereoMatcher::confidence`] is computed: the second best match takes a tenth of the time. Default false.
     pub confidence: bool,
-    /// Most bytes the matcher may hold; `None` sets no limit. Where the whole image does not fit, costs are aggregated in
-    /// strips of rows that overlap by 32: at most 0.1 % of the pixels then differ by more than half a pixel from what
-    /// they are without the limit. Default `None`. See [`crate::StereoMatcher::memory`].
+    /// Maximum number of bytes of the matcher; `None` sets no limit. If the whole image does not fit, costs are aggregated in strips of rows
+    /// that overlap by 32: at most 0.1 % of the pixels then differ by more than half a pixel from the result without the limit. Default
+    /// `None`. See [`crate::StereoMatcher::memory`].
     pub max_memory: Option<usize>,
 }
 
@@ -225,19 +221,19 @@ impl Default for StereoOptions {
     }
 }
 
-/// More disparities than any rectified pair of photographs shows; keeps indices in 16 bits with room to spare.
+/// Maximum number of disparities: more than any rectified pair needs, and indices fit 16 bits.
 pub(crate) const MAX_DISPARITIES: usize = 4096;
 
 impl StereoOptions {
-    /// These penalties, with what `p2` falls to at edges brought between them.
+    /// Sets the penalties, and clamps `p2_min` to their range.
     pub fn with_penalties(self, p1: u8, p2: u8) -> Self {
         Self { p1, p2, p2_min: self.p2_min.clamp(p1, p2.max(p1)), ..self }
     }
 
-    /// Checks the options by themselves, without an image.
+    /// Checks the ranges of the options.
     ///
     /// # Errors
-    /// [`StereoError::Range`] or [`StereoError::Option`] with the first value that is out of range.
+    /// [`StereoError::Range`] or [`StereoError::Option`] with the first value out of range.
     pub fn validate(&self) -> Result<(), StereoError> {
         if self.disparities == 0 || self.disparities > MAX_DISPARITIES {
             return Err(StereoError::Range { disparities: self.disparities, max: MAX_DISPARITIES });

@@ -1,4 +1,4 @@
-//! Path sums by themselves, with costs that are given: what aggregation takes without costs and winners.
+//! Aggregation of given costs, without computing costs or selecting winners, for benchmarks.
 
 use crate::aligned_buffer::AlignedBuffer;
 use crate::cost::{Frame, Penalties};
@@ -9,8 +9,8 @@ use crate::{Paths, StereoError, StereoOptions};
 use cv_core::{Cancelled, ImageView, Progress, Stage};
 use fearless_simd::Level;
 
-/// Semi-global path sums of costs that are given, for benchmarks: both sweeps over the whole image, each of which reads
-/// the costs and writes the sums of its half of the paths.
+/// Semi-global path sums of given costs, for benchmarks: both sweeps over the whole image, each of which reads the costs and writes the
+/// sums of its half of the paths.
 #[derive(Debug)]
 pub struct PathSums {
     options: StereoOptions,
@@ -26,8 +26,8 @@ pub struct PathSums {
 }
 
 impl PathSums {
-    /// Path sums of `cost(x, y, k)`, at index `k` of [`StereoOptions::disparities`], guided by `gray`. Costs may be as
-    /// large as the bits of [`StereoOptions::census`].
+    /// Creates the sums of `cost(x, y, k)`, at index `k` of [`StereoOptions::disparities`], with penalties by `gray`. Costs may be as large
+    /// as the number of bits of [`StereoOptions::census`].
     ///
     /// # Errors
     /// [`StereoError`] for options out of range.
@@ -75,7 +75,7 @@ impl PathSums {
         })
     }
 
-    /// Sums up all paths.
+    /// Computes the sums of all paths.
     ///
     /// # Errors
     /// [`Cancelled`].
@@ -108,13 +108,13 @@ impl PathSums {
         one.and(other)
     }
 
-    /// The sum of all paths at a pixel and index.
+    /// Returns the sum of all paths at a pixel and index.
     pub fn at(&mut self, x: usize, y: usize, k: usize) -> u16 {
         let at = (y * self.width + x) * self.layout.depth + place(k, self.layout.group, self.layout.lanes);
         self.sums.iter_mut().map(|sums| u16::from(sums.as_mut_slice()[at])).sum()
     }
 
-    /// Bytes that [`PathSums::run`] reads and writes: the costs twice, and twice as many sums.
+    /// Returns the bytes that [`PathSums::run`] reads and writes: the costs twice, and twice as many sums.
     pub fn traffic(&self) -> usize {
         4 * self.width * self.height * self.layout.depth
     }
@@ -126,7 +126,7 @@ mod tests {
     use cv_core::{GrayU8, Silent};
     use cv_synth::instruction_sets;
 
-    /// Path sums by definition, with one P2.
+    /// Computes path sums by definition, with one P2.
     fn sums_plain(size: (i64, i64), n: usize, cost: impl Fn(usize, usize, usize) -> u8, p1: u16, p2: u16) -> Vec<u16> {
         let (width, height) = size;
         let mut sums = vec![0; width as usize * height as usize * n];
@@ -164,14 +164,14 @@ mod tests {
         let (width, height) = (37, 11);
         let cost = |x: usize, y: usize, k: usize| ((x * 7919 + y * 104_729 + k * 31 + x * k) % 97 % 25) as u8;
         let gray = GrayU8::from_fn(width, height, |_, _| [100]);
-        // One group, with and without lanes that only pad, and two.
+        // One group, with and without padding, and two.
         for disparities in [50, 128, 256] {
             let options = StereoOptions { disparities, ..Default::default() };
             let (p1, p2) = (u16::from(options.p1), u16::from(options.p2));
             let expected = sums_plain((width as i64, height as i64), disparities, cost, p1, p2);
             for level in instruction_sets() {
                 let mut sums = PathSums::at_level(level, options.clone(), gray.view(), cost).unwrap();
-                // Twice, so that what a run leaves behind would show.
+                // Twice, so that state left by a run would show.
                 for _ in 0..2 {
                     sums.run(&Silent).unwrap();
                 }

@@ -1,8 +1,8 @@
-//! What it costs that pixels lie on a plane: how alike the two photographs are there, at fractions of a pixel, averaged over surroundings of the same gray.
+//! The data term of slanted planes: the dissimilarity of both images at sub-pixel correspondences, aggregated by a guided filter.
 //!
-//! A pixel and its partner are compared by the census transform and by their gradients, of which neither an offset nor, mostly, another exposure changes much. The
-//! costs of a plane are averaged by the guided filter (He, Sun & Tang, PAMI 2013), as in Taniai et al., "Continuous 3D label stereo matching using local expansion
-//! moves", PAMI 2018.
+//! A pixel and its correspondence are compared by the census transform and by their gradients, which are robust to differences in
+//! exposure. The costs of a plane are filtered with the left image as the guide (He, Sun & Tang, PAMI 2013), as in Taniai et al.,
+//! "Continuous 3D label stereo matching using local expansion moves", PAMI 2018.
 
 use crate::PixelState;
 use crate::census::{Gray, MARGIN};
@@ -11,38 +11,39 @@ use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
 
-/// Positions a pixel at which the right photograph is described.
+/// Sub-pixel positions per pixel at which the right image is described.
 const PHASES: usize = 4;
-/// Cost of a census bit that differs, and the share of the bits above which a pixel and its partner have nothing in common.
-const BIT: f32 = 1.0 / 24.0;
-const MOST_BITS: f32 = 12.0;
-/// Steps of a gradient a gray level (of 255) per px, its difference in gray levels per px that counts the most, and that cost, of each direction.
-const STEPS: f32 = 4.0;
-const MOST_GRADIENT: f32 = 8.0;
-const GRADIENT: f32 = 0.15;
-/// What a pixel costs that the right camera does not see, because its partner lies outside or is hidden behind something nearer; a match costs 0.1 to 0.4.
-const OUTSIDE: f32 = 0.45;
-const HIDDEN: f32 = 0.55;
-/// What one costs that would hide what the right camera is known to see, and by how many px it has to be nearer (or farther, to be hidden).
-const HIDES: f32 = 0.8;
-const NEARER: f32 = 2.0;
-/// Radius of the guided filter in px, and the variance (in squared gray levels of 255) below which a window is of one gray.
+/// Cost of a differing census bit, and the Hamming distance at which it is truncated.
+const BIT_COST: f32 = 1.0 / 24.0;
+const MAX_BITS: f32 = 12.0;
+/// Quantization of gradients in steps per gray level (of 255) per px; the difference in gray levels per px at which the gradient cost is
+/// truncated, and its maximum, of each direction.
+const GRADIENT_STEPS: f32 = 4.0;
+const MAX_GRADIENT: f32 = 8.0;
+const GRADIENT_COST: f32 = 0.15;
+/// Costs of out-of-view and of occluded pixels; a match costs 0.1 to 0.4.
+const OUT_OF_VIEW_COST: f32 = 0.45;
+const OCCLUDED_COST: f32 = 0.55;
+/// Cost of a pixel that would occlude a matched surface of the right image, and the difference in px from which a surface is in front.
+const OCCLUDING_COST: f32 = 0.8;
+const OCCLUSION_STEP: f32 = 2.0;
+/// Radius of the guided filter in px, and its regularization in squared gray levels of 255.
 const RADIUS: usize = 3;
-const VARIANCE: f32 = 15.0;
-/// Steps a px in which the disparities that the right camera sees are kept, from [`LEAST`] on; 0 is for none.
-const SEEN_STEPS: f32 = 8.0;
-const LEAST: f32 = 32.0;
+const REGULARIZATION: f32 = 15.0;
+/// Quantization of the known disparities of the right image in steps per px, and their offset in px; 0 is for none.
+const KNOWN_STEPS: f32 = 8.0;
+const KNOWN_OFFSET: f32 = 32.0;
 
 /// A plane of disparities, `a x + b y + c`.
 pub(crate) type Plane = [f32; 3];
 
-/// Disparity of a plane at a pixel.
+/// Returns the disparity of a plane at a pixel.
 #[inline(always)]
 pub(crate) fn at([a, b, c]: Plane, x: usize, y: usize) -> f32 {
     a * x as f32 + b * y as f32 + c
 }
 
-/// Columns and rows from the first to before the last.
+/// A rectangle of pixels, right and bottom exclusive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Rectangle {
     pub(crate) left: usize,
@@ -60,7 +61,7 @@ impl Rectangle {
         self.bottom - self.top
     }
 
-    /// Larger by so many pixels on all sides, as far as the picture reaches.
+    /// Returns the rectangle dilated by `by` pixels and cut at the image border.
     pub(crate) fn grown(&self, by: usize, (width, height): (usize, usize)) -> Self {
         Self {
             left: self.left.saturating_sub(by),
@@ -71,19 +72,19 @@ impl Rectangle {
     }
 }
 
-/// A pair of photographs, described for comparison.
+/// The descriptors of an image pair.
 #[derive(Debug)]
 pub(crate) struct PlaneCost {
     pub(crate) width: usize,
     pub(crate) height: usize,
-    /// Bits 0 to 23: the census of 5×5 pixels; 24 to 31 and 32 to 39: the gradient across and down; 48 to 63, of the right photograph: the disparity that it is
-    /// known to see there.
+    /// Bits 0 to 23: census of 5×5 pixels; 24 to 31 and 32 to 39: horizontal and vertical gradient; 48 to 63, of the right image: its known
+    /// disparity.
     left: Vec<u64>,
-    /// [`PHASES`] a pixel.
+    /// [`PHASES`] per pixel.
     right: Vec<u64>,
-    /// Gray levels 0 to 255 of the left photograph.
+    /// Gray levels 0 to 255 of the left image.
     gray: Vec<f32>,
-    /// Their mean in windows of the filter, and 1 / (their variance + [`VARIANCE`]).
+    /// Their mean in the windows of the filter, and 1 / (variance + [`REGULARIZATION`]).
     mean: Vec<f32>,
     inverse_variance: Vec<f32>,
     bits: [f32; 32],
@@ -91,24 +92,24 @@ pub(crate) struct PlaneCost {
     lowest: f32,
 }
 
-/// Memory of [`PlaneCost::of`], kept between planes.
+/// Buffers of [`PlaneCost::compute`], reused between planes.
 #[derive(Debug, Default)]
 pub(crate) struct Scratch {
     cost: Vec<f32>,
     product: Vec<f32>,
     sums: Vec<f32>,
     rows: [Vec<f32>; 2],
-    /// The costs of the last rectangle, row by row.
+    /// The costs of the last rectangle, in raster order.
     pub(crate) result: Vec<f32>,
 }
 
 impl PlaneCost {
-    /// Bytes for photographs of this size.
+    /// Returns the bytes for images of this size.
     pub(crate) fn bytes(width: usize, height: usize) -> usize {
         width.saturating_mul(height).saturating_mul((1 + PHASES) * size_of::<u64>() + 3 * size_of::<f32>())
     }
 
-    /// `lowest` is the smallest disparity there is.
+    /// Describes a pair. `lowest` is the smallest disparity of the search range.
     pub(crate) fn new(
         level: Level,
         [left, right]: [&Gray; 2],
@@ -116,7 +117,7 @@ impl PlaneCost {
         stage: &Stage<'_>,
     ) -> Result<Self, Cancelled> {
         let (width, height) = (left.width, left.height);
-        // The gray levels of a sensor of few bits are stretched, alike in both.
+        // Gray levels of a sensor of few bits are stretched, both images by the same factor.
         let ends = |row: &[u16]| row.iter().fold((u16::MAX, 0), |(low, high), &v| (low.min(v), high.max(v)));
         let join = |a: (u16, u16), b: (u16, u16)| (a.0.min(b.0), a.1.max(b.1));
         let (low, high) = left.values.par_chunks(left.stride()).map(ends).reduce(|| (u16::MAX, 0), join);
@@ -141,7 +142,7 @@ impl PlaneCost {
         let (mut sums, mut rows) = (vec![0.0; 2 * width], [vec![0.0; width], vec![0.0; width]]);
         box_means(&mut mean, &mut square, (width, height), &mut sums, &mut rows);
         for (square, mean) in square.iter_mut().zip(&mean) {
-            *square = 1.0 / ((*square - mean * mean).max(0.0) + VARIANCE);
+            *square = 1.0 / ((*square - mean * mean).max(0.0) + REGULARIZATION);
         }
         stage.check()?;
         Ok(Self {
@@ -152,8 +153,8 @@ impl PlaneCost {
             gray,
             mean,
             inverse_variance: square,
-            bits: std::array::from_fn(|n| BIT * (n as f32).min(MOST_BITS)),
-            gradients: std::array::from_fn(|n| GRADIENT * (n as f32 / (STEPS * MOST_GRADIENT)).min(1.0)),
+            bits: std::array::from_fn(|n| BIT_COST * (n as f32).min(MAX_BITS)),
+            gradients: std::array::from_fn(|n| GRADIENT_COST * (n as f32 / (GRADIENT_STEPS * MAX_GRADIENT)).min(1.0)),
             lowest,
         })
     }
@@ -162,13 +163,13 @@ impl PlaneCost {
         (self.width, self.height)
     }
 
-    /// Gray level 0 to 255 of a pixel.
+    /// Returns the gray level 0 to 255 of a pixel of the left image.
     pub(crate) fn gray(&self, pixel: usize) -> f32 {
         self.gray[pixel]
     }
 
-    /// Takes down which disparities the right camera sees: those of the matched pixels, the nearest of each place.
-    pub(crate) fn see(&mut self, disparity: &[f32], states: &[PixelState]) {
+    /// Sets the known disparities of the right image: those of the matched pixels, the nearest at each pixel.
+    pub(crate) fn set_known(&mut self, disparity: &[f32], states: &[PixelState]) {
         let (width, lowest) = (self.width, self.lowest);
         let rows = disparity.par_chunks(width).zip(states.par_chunks(width));
         self.right.par_chunks_mut(width * PHASES).zip(rows).for_each_init(
@@ -179,7 +180,7 @@ impl PlaneCost {
                     let column = x as f32 - d + 0.5;
                     if state == PixelState::Matched && column >= 0.0 && column < width as f32 {
                         let place = &mut seen[column as usize];
-                        *place = (*place).max(((d - lowest + LEAST) * SEEN_STEPS).clamp(1.0, 65535.0) as u64);
+                        *place = (*place).max(((d - lowest + KNOWN_OFFSET) * KNOWN_STEPS).clamp(1.0, 65535.0) as u64);
                     }
                 }
                 for (x, phases) in right.chunks_exact_mut(PHASES).enumerate() {
@@ -192,8 +193,8 @@ impl PlaneCost {
         );
     }
 
-    /// Costs of a plane over a rectangle, into `scratch.result`.
-    pub(crate) fn of(&self, level: Level, plane: Plane, place: Rectangle, scratch: &mut Scratch) {
+    /// Computes the costs of a plane over a rectangle, into `scratch.result`.
+    pub(crate) fn compute(&self, level: Level, plane: Plane, place: Rectangle, scratch: &mut Scratch) {
         let around = place.grown(2 * RADIUS, self.size());
         let (width, height) = (around.width(), around.height());
         let Scratch { cost, product, sums, rows, result } = scratch;
@@ -224,7 +225,7 @@ impl PlaneCost {
     }
 }
 
-/// A row between the pixels, by the cubic through four of them (Catmull & Rom), and scaled.
+/// Interpolates a row at a sub-pixel phase by Catmull-Rom splines, and scales it.
 fn shift_row(row: &[u16], phase: usize, scale: f32, to: &mut [f32]) {
     let t = phase as f32 / PHASES as f32;
     let value = |x: usize| f32::from(row[x.min(row.len() - 1)]) * scale;
@@ -234,7 +235,7 @@ fn shift_row(row: &[u16], phase: usize, scale: f32, to: &mut [f32]) {
     }
 }
 
-/// Describes every pixel of `values` (rows with margins) into each `step`-th element of `out`, from `first` on.
+/// Describes every pixel of `values` (rows with margins) into every `step`-th element of `out`, from `first` on.
 fn describe(
     level: Level,
     values: &[f32],
@@ -256,7 +257,7 @@ fn describe(
 
 #[simd]
 fn describe_row<S: Simd>(_: S, rows: [&[f32]; 5], step: usize, first: usize, out: &mut [u64]) {
-    let gradient = |v: f32| (128.5 + STEPS * v).clamp(0.0, 255.0) as u64;
+    let gradient = |v: f32| (128.5 + GRADIENT_STEPS * v).clamp(0.0, 255.0) as u64;
     for (x, out) in out[first..].iter_mut().step_by(step).enumerate() {
         let center = rows[2][x + MARGIN];
         let mut bits = 0;
@@ -265,7 +266,7 @@ fn describe_row<S: Simd>(_: S, rows: [&[f32]; 5], step: usize, first: usize, out
                 bits = bits << 1 | u64::from(neighbor < center);
             }
         }
-        // The center itself, bit 12, is never darker than itself: left out.
+        // Without the bit of the center, bit 12.
         let bits = bits & 0xFFF | bits >> 1 & 0xFF_F000;
         let across = 0.5 * (rows[2][x + MARGIN + 1] - rows[2][x + MARGIN - 1]);
         let down = 0.5 * (rows[3][x + MARGIN] - rows[1][x + MARGIN]);
@@ -273,7 +274,7 @@ fn describe_row<S: Simd>(_: S, rows: [&[f32]; 5], step: usize, first: usize, out
     }
 }
 
-/// What a plane costs at each pixel by itself, and that times its gray.
+/// Computes the unfiltered costs of a plane, and their products with the gray levels.
 #[simd]
 fn raw_costs<S: Simd>(_: S, pair: &PlaneCost, plane: Plane, place: Rectangle, cost: &mut [f32], product: &mut [f32]) {
     let width = place.width();
@@ -287,24 +288,25 @@ fn raw_costs<S: Simd>(_: S, pair: &PlaneCost, plane: Plane, place: Rectangle, co
             let x = place.left + x;
             let d = at(plane, x, y);
             let position = (x as f32 - d) * PHASES as f32 + 0.5;
-            // Beyond the row, and NaN, counts as outside.
+            // Positions outside the row, and NaN, are out of view.
             let inside = position >= 0.0 && position < last as f32;
             let right = row[if inside { position as usize } else { 0 }];
             let different = left ^ right;
             let gradient =
                 |shift: u32| pair.gradients[usize::from(((left >> shift) as u8).abs_diff((right >> shift) as u8))];
-            let alike = pair.bits[((different & 0xFF_FFFF).count_ones() & 31) as usize] + gradient(24) + gradient(32);
+            let dissimilarity =
+                pair.bits[((different & 0xFF_FFFF).count_ones() & 31) as usize] + gradient(24) + gradient(32);
             let seen = (right >> 48) as f32;
-            let nearer = (d - pair.lowest + LEAST) * SEEN_STEPS - seen;
+            let nearer = (d - pair.lowest + KNOWN_OFFSET) * KNOWN_STEPS - seen;
             let known = seen > 0.0;
-            let c = if known && nearer > NEARER * SEEN_STEPS {
-                HIDES
-            } else if known && nearer < -NEARER * SEEN_STEPS {
-                HIDDEN
+            let c = if known && nearer > OCCLUSION_STEP * KNOWN_STEPS {
+                OCCLUDING_COST
+            } else if known && nearer < -OCCLUSION_STEP * KNOWN_STEPS {
+                OCCLUDED_COST
             } else {
-                alike
+                dissimilarity
             };
-            let c = if inside { c } else { OUTSIDE };
+            let c = if inside { c } else { OUT_OF_VIEW_COST };
             (*cost, *product) = (c, c * gray);
         }
     }
@@ -322,7 +324,7 @@ fn simd_means<S: Simd>(
     box_means(a, b, size, sums, rows);
 }
 
-/// Means of two pictures over windows of `2 RADIUS + 1` pixels, less at the borders, in place. `sums` holds two rows, `rows` one each.
+/// Computes means of two images over windows of `2 RADIUS + 1` pixels, cut at the borders, in place. `sums` has two rows, `rows` one each.
 #[inline(always)]
 fn box_means(
     a: &mut [f32],
@@ -331,7 +333,7 @@ fn box_means(
     sums: &mut [f32],
     rows: &mut [Vec<f32>; 2],
 ) {
-    // Along the rows, both at once: each waits for the sum before it.
+    // Along the rows, both images at once, since each sum depends on the previous one.
     for (a, b) in a.chunks_exact_mut(width).zip(b.chunks_exact_mut(width)) {
         let [copy_a, copy_b] = rows;
         let (copy_a, copy_b) = (&mut copy_a[..width], &mut copy_b[..width]);
@@ -361,7 +363,7 @@ fn box_means(
     }
 }
 
-/// Means down the columns. The rows that leave a window are needed after they have been overwritten: the last ones are kept in a ring.
+/// Computes means along the columns. Rows that leave a window have been overwritten: a ring buffer has their old values.
 #[inline(always)]
 fn columns(values: &mut [f32], (width, height): (usize, usize), sum: &mut [f32], ring: &mut Vec<f32>) {
     ring.clear();
@@ -396,10 +398,10 @@ mod tests {
         Stage::new(&Silent, "expand", 1).unwrap()
     }
 
-    /// A wall of noise, seen at a slanted disparity `0.1 x + 3`.
+    /// A textured wall with disparity `0.1 x + 3`.
     fn pair() -> ([Gray; 2], (usize, usize)) {
         let (width, height) = (60, 40);
-        // Smooth, so that it is known between pixels.
+        // Smooth, so that it can be evaluated between pixels.
         let texture = |x: f64, y: f64| 30_000.0 + 9_000.0 * (0.9 * x).sin() + 9_000.0 * (0.7 * y + 0.31 * x).cos();
         let picture = |f: &dyn Fn(f64, f64) -> f64| {
             let stride = width + 2 * MARGIN;
@@ -413,13 +415,13 @@ mod tests {
     }
 
     #[test]
-    fn the_plane_that_is_there_costs_least() {
+    fn the_true_plane_has_the_lowest_cost() {
         let ([left, right], (width, height)) = pair();
         let cost = PlaneCost::new(Level::new(), [&left, &right], 0.0, &stage()).unwrap();
         let place = Rectangle { left: 20, top: 5, right: width - 5, bottom: height - 5 };
         let mut scratch = Scratch::default();
         let mut mean = |plane: Plane| {
-            cost.of(Level::new(), plane, place, &mut scratch);
+            cost.compute(Level::new(), plane, place, &mut scratch);
             scratch.result.iter().sum::<f32>() / scratch.result.len() as f32
         };
         let there = mean([0.1, 0.0, 3.0]);
@@ -427,23 +429,23 @@ mod tests {
         for other in [[0.1, 0.0, 3.5], [0.1, 0.0, 2.5], [0.06, 0.0, 4.6], [0.1, 0.05, 2.0]] {
             assert!(mean(other) > there + 0.03, "{other:?}: {} against {there}", mean(other));
         }
-        // Outside the right photograph everything costs the same.
-        assert!((mean([0.0, 0.0, 100.0]) - OUTSIDE).abs() < 1e-5);
+        // Out-of-view costs are constant.
+        assert!((mean([0.0, 0.0, 100.0]) - OUT_OF_VIEW_COST).abs() < 1e-5);
     }
 
     #[test]
-    fn what_the_right_camera_sees_hides_what_lies_behind_and_forbids_what_lies_before() {
+    fn known_disparities_occlude_farther_planes_and_penalize_nearer_ones() {
         let ([left, right], (width, height)) = pair();
         let mut cost = PlaneCost::new(Level::new(), [&left, &right], 0.0, &stage()).unwrap();
-        cost.see(&vec![6.0; width * height], &vec![PixelState::Matched; width * height]);
+        cost.set_known(&vec![6.0; width * height], &vec![PixelState::Matched; width * height]);
         let place = Rectangle { left: 30, top: 10, right: 36, bottom: 16 };
         let mut scratch = Scratch::default();
         let mut mean = |d: f32| {
-            cost.of(Level::new(), [0.0, 0.0, d], place, &mut scratch);
+            cost.compute(Level::new(), [0.0, 0.0, d], place, &mut scratch);
             scratch.result.iter().sum::<f32>() / scratch.result.len() as f32
         };
-        assert!((mean(1.0) - HIDDEN).abs() < 1e-5 && (mean(11.0) - HIDES).abs() < 1e-5);
-        assert!(mean(6.0) < HIDDEN - 0.1);
+        assert!((mean(1.0) - OCCLUDED_COST).abs() < 1e-5 && (mean(11.0) - OCCLUDING_COST).abs() < 1e-5);
+        assert!(mean(6.0) < OCCLUDED_COST - 0.1);
     }
 
     #[test]
@@ -471,7 +473,7 @@ mod tests {
         let place = Rectangle { left: 0, top: 0, right: width, bottom: height };
         let all = instruction_sets().into_iter().map(|level| {
             let mut scratch = Scratch::default();
-            PlaneCost::new(level, [&left, &right], 0.0, &stage()).unwrap().of(
+            PlaneCost::new(level, [&left, &right], 0.0, &stage()).unwrap().compute(
                 level,
                 [0.09, 0.01, 3.0],
                 place,

@@ -1,8 +1,8 @@
-//! Rectification: turning both cameras, in thought, until their rows coincide.
+//! Rectification: virtual rotations of both cameras that make epipolar lines coincide with rows.
 //!
-//! The common orientation has its x axis along the baseline and looks as nearly as possible where the two cameras look on
-//! average (Bouguet's way of splitting the rotation; Fusiello, Trucco & Verri, "A compact algorithm for rectification of
-//! stereo pairs", MVA 2000, for the axis).
+//! The common orientation has its x axis along the baseline, and its optical axis as near as possible to the mean of those of the
+//! cameras (Bouguet's splitting of the rotation; Fusiello, Trucco & Verri, "A compact algorithm for rectification of stereo pairs", MVA
+//! 2000, for the x axis).
 
 use crate::StereoGeometry;
 use cv_core::{
@@ -18,11 +18,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
 pub struct RectifyOptions {
-    /// From 0, where both rectified images show the scene in every pixel, to 1, where they show every pixel of the
-    /// originals. Default 0 (OpenCV's usual choice).
+    /// From 0, where every pixel of both rectified images is valid, to 1, where they contain every pixel of the originals. Default 0
+    /// (OpenCV's usual choice).
     pub alpha: f64,
-    /// Width and height of the rectified images in px; `None` for those of the left camera (exchanged where the rig is
-    /// vertical). Default `None`.
+    /// Width and height of the rectified images in px; `None` for those of the left camera (exchanged for vertical rigs). Default `None`.
     pub size: Option<(usize, usize)>,
 }
 
@@ -36,47 +35,47 @@ impl Default for RectifyOptions {
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum RectifyError {
-    /// A camera is none.
+    /// A camera is invalid.
     #[error("the {side} camera: {error}")]
     Camera {
-        /// `left` or `right`; `only` of a camera by itself.
+        /// `left` or `right`; `only` for a single camera.
         side: &'static str,
-        /// What is wrong with it.
+        /// Its error.
         error: CameraError,
     },
-    /// The two cameras stand at the same place, or the translation is not finite.
+    /// The camera centers coincide, or the translation is not finite.
     #[error("the cameras are {} apart: there is no parallax between them", round_to_four_digits(*.baseline))]
     NoBaseline {
         /// Length of the translation.
         baseline: f64,
     },
-    /// The right camera stands left of the left one, or the lower one above.
+    /// The right camera is left of the left one, or the lower one above.
     #[error(
-        "the second camera stands {} {} the first: they are exchanged",
+        "the second camera is {} {} the first: they are exchanged",
         round_to_four_digits(*.distance), if *.vertical { "above" } else { "left of" }
     )]
     Exchanged {
         /// By how much, in the unit of the rig.
         distance: f64,
-        /// Whether the rig is a vertical one.
+        /// Whether the rig is vertical.
         vertical: bool,
     },
-    /// The cameras stand one behind the other, or look apart, so that rectified ones would see something else.
+    /// One camera is behind the other, or their optical axes diverge, so that the rectified views would have another field of view.
     #[error(
-        "the {side} camera would have to turn by {degrees:.1}°, more than {limit}°, to look across the baseline: the rig is not a stereo rig"
+        "the {side} camera would have to be rotated by {degrees:.1}°, more than {limit}°, to face perpendicular to the baseline: the rig is not a stereo rig"
     )]
     TooFarTurned {
         /// `left` or `right`.
         side: &'static str,
-        /// By how much it would have to turn.
+        /// The rotation it would need.
         degrees: f64,
-        /// The most that is done.
+        /// The maximum rotation.
         limit: f64,
     },
-    /// The two cameras see nothing in common after rectification.
+    /// The fields of view do not overlap after rectification.
     #[error("the rectified cameras have no field of view in common")]
     NoOverlap,
-    /// An image is not of the size its camera was calibrated for.
+    /// An image does not have the size its camera was calibrated for.
     #[error("the image is {}×{} px, its camera was calibrated for {}×{} px", image.0, image.1, expected.0, expected.1)]
     ImageSize {
         /// Width and height of the image.
@@ -84,7 +83,7 @@ pub enum RectifyError {
         /// Width and height of the camera's images.
         expected: (usize, usize),
     },
-    /// The rectified image is larger than memory can address.
+    /// The rectified image is too large to be addressed.
     #[error("a rectified image of {width}×{height} px is larger than memory can address")]
     TooLarge {
         /// Width in px.
@@ -100,26 +99,26 @@ pub enum RectifyError {
     Cancelled(#[from] Cancelled),
 }
 
-/// The most a camera is turned: beyond, a plane image sensor would see the scene at a grazing angle.
+/// Maximum rotation of a camera: beyond, the rectified image plane would be at a grazing angle to the scene.
 const MAX_TURN_DEGREES: f64 = 60.0;
 
 /// One view of a rectified rig.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct RectifiedView {
-    /// The camera that took the original.
+    /// The camera of the original image.
     pub source: Camera,
-    /// The camera that would have taken the rectified image.
+    /// The virtual camera of the rectified image.
     pub camera: Camera,
-    /// Takes directions from the source's frame to the rectified one.
+    /// Rotates directions from the frame of the source camera to the rectified one.
     pub rotation: Rotation3<f64>,
 }
 
 impl RectifiedView {
-    /// One camera as it would be without distortion, looking where it does: square pixels, and of the picture as much as `options` say.
+    /// Returns the view of one camera without distortion and rotation: square pixels, and the field of view that `options` select.
     ///
     /// # Errors
-    /// [`RectifyError`] where the camera is none, an option is out of range, or the picture has no middle part that the lens reaches.
+    /// [`RectifyError`] if the camera is invalid, an option is out of range, or the distortion model covers no central part of the image.
     pub fn undistorted(source: &Camera, options: &RectifyOptions) -> Result<Self, RectifyError> {
         source.validate().map_err(|error| RectifyError::Camera { side: "only", error })?;
         OptionError::check("alpha", options.alpha, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
@@ -130,18 +129,18 @@ impl RectifiedView {
         Ok(Self { source: *source, camera, rotation })
     }
 
-    /// Where a pixel of the rectified image lies in the original; `None` where the original's camera does not look.
+    /// Maps a pixel of the rectified image to the original; `None` outside the field of view of the original camera.
     pub fn source_pixel(&self, pixel: Point2<f64>) -> Option<Point2<f64>> {
         let n = self.camera.normalize(pixel);
         let ray = self.rotation.inverse_transform_point(&Point3::new(n.x, n.y, 1.0));
         if ray.z <= 0.0 {
             return None;
         }
-        // Beyond its turning point a lens model folds rays from far outside back into the image.
+        // Beyond the monotonic range of a distortion model, rays from far outside fold back into the image.
         self.source.denormalize_in_range(Point2::new(ray.x / ray.z, ray.y / ray.z))
     }
 
-    /// Where every pixel of the rectified image comes from, for many originals. The lens is asked for each pixel here, once.
+    /// Computes the warp map from the rectified image to the original, for many originals: the distortion model is evaluated only here.
     ///
     /// # Errors
     /// [`RectifyError::TooLarge`], [`RectifyError::Cancelled`].
@@ -150,7 +149,7 @@ impl RectifiedView {
         let stage = Stage::new(progress, "rectify", size.1)?;
         let stopped = AtomicBool::new(false);
         let source = |x: usize, y: usize| {
-            // Once it was stopped, nothing is left to do for any pixel.
+            // Once stopped, the remaining pixels are skipped.
             if stopped.load(Ordering::Relaxed) {
                 return None;
             }
@@ -164,10 +163,11 @@ impl RectifiedView {
         if stopped.into_inner() { Err(Cancelled.into()) } else { Ok(map) }
     }
 
-    /// The rectified image of an original, bilinear, and where it shows anything; black elsewhere. Of many originals, make the [`map`](Self::map) once.
+    /// Rectifies an original by bilinear interpolation, and returns the mask of valid pixels; others are black. For many originals, compute
+    /// the [`map`](Self::map) once.
     ///
     /// # Errors
-    /// [`RectifyError::ImageSize`] where the image is not of the camera's size; [`RectifyError::Cancelled`].
+    /// [`RectifyError::ImageSize`] if the image does not have the camera's size; [`RectifyError::Cancelled`].
     pub fn apply<T: Pixel, const C: usize>(
         &self,
         image: ImageView<'_, T, C>,
@@ -181,7 +181,7 @@ impl RectifiedView {
         Ok((map.compute(image).map_err(|e| self.failed(&e))?, map.inside()))
     }
 
-    /// Why no image was made by a map.
+    /// Converts the error of a warp.
     fn failed(&self, error: &WarpError) -> RectifyError {
         match *error {
             WarpError::SourceSize { got, expected } => RectifyError::ImageSize { image: got, expected },
@@ -189,9 +189,9 @@ impl RectifiedView {
         }
     }
 
-    /// How many px of the original the outermost pixel of the rectified image lies outside it; infinity where the camera does
-    /// not look there at all, negative inside.
-    fn beyond_the_border(&self) -> f64 {
+    /// Returns by how many px of the original the border of the rectified image is at most outside it; infinity outside the field of view of
+    /// the camera, negative inside.
+    fn max_px_outside(&self) -> f64 {
         let last = |n: usize| n as f64 - 1.0;
         let (w, h) = (last(self.source.width), last(self.source.height));
         let outside = |x: usize, y: usize| {
@@ -204,14 +204,14 @@ impl RectifiedView {
         columns.chain(rows).fold(-f64::INFINITY, f64::max)
     }
 
-    /// Where a pixel of the original lies in the rectified image; `None` behind the rectified camera.
+    /// Maps a pixel of the original to the rectified image; `None` behind the rectified camera.
     pub fn rectified_pixel(&self, pixel: Point2<f64>) -> Option<Point2<f64>> {
         let n = self.source.normalize(pixel);
         self.camera.project(&(self.rotation * Point3::new(n.x, n.y, 1.0)))
     }
 }
 
-/// A rectified rig: both views, and what makes depth of their disparities.
+/// A rectified rig: both views, and the geometry of their disparities.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct Rectification {
@@ -219,10 +219,10 @@ pub struct Rectification {
     pub left: RectifiedView,
     /// The right (or lower) view.
     pub right: RectifiedView,
-    /// Makes depth of disparities, in the unit of the rig.
+    /// Converts disparities to depth, in the unit of the rig.
     pub geometry: StereoGeometry,
-    /// True where one camera stands above the other. The rectified images are then turned by a quarter, so that rows
-    /// still coincide: their x axis points down in the scene.
+    /// True if one camera is above the other. The rectified images are then rotated by 90°, so that epipolar lines are rows: their x axis
+    /// points down in the scene.
     pub vertical: bool,
 }
 
@@ -230,9 +230,9 @@ impl Rectification {
     /// Rectifies a rig.
     ///
     /// # Errors
-    /// [`RectifyError`] with the reason why it cannot be done.
+    /// [`RectifyError`] with the reason.
     pub fn new(rig: &StereoRig, options: &RectifyOptions) -> Result<Self, RectifyError> {
-        let (x, baseline) = along_the_baseline(rig)?;
+        let (x, baseline) = baseline_direction(rig)?;
         OptionError::check("alpha", options.alpha, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
         let center = rig.right_from_left.center();
         let vertical = center.y.abs() > center.x.abs();
@@ -240,7 +240,7 @@ impl Rectification {
         if along < 0.0 {
             return Err(RectifyError::Exchanged { distance: -along, vertical });
         }
-        let rotations = rotations(x, &rig.right_from_left.rotation)?;
+        let rotations = common_rotations(x, &rig.right_from_left.rotation)?;
 
         let native = (rig.left.width, rig.left.height);
         let (width, height) = options.size.unwrap_or(if vertical { (native.1, native.0) } else { native });
@@ -256,20 +256,20 @@ impl Rectification {
         })
     }
 
-    /// `Q` of [`StereoGeometry::q`].
+    /// Returns `Q` of [`StereoGeometry::q`].
     pub fn q(&self) -> Matrix4<f64> {
         self.geometry.q()
     }
 
-    /// Share of the pixels of each rectified image that the originals show, left and right, on a grid of every fourth.
+    /// Returns the fraction of valid pixels of the left and of the right rectified image, on a grid of every fourth pixel.
     pub fn valid_area(&self) -> (f64, f64) {
-        let share = |view: &RectifiedView| {
+        let valid_fraction = |view: &RectifiedView| {
             let (w, h) = (view.camera.width, view.camera.height);
-            let (mut seen, mut all) = (0usize, 0usize);
+            let (mut valid, mut all) = (0usize, 0usize);
             for y in (0..h).step_by(4) {
                 for x in (0..w).step_by(4) {
                     all += 1;
-                    seen += usize::from(view.source_pixel(Point2::new(x as f64, y as f64)).is_some_and(|p| {
+                    valid += usize::from(view.source_pixel(Point2::new(x as f64, y as f64)).is_some_and(|p| {
                         p.x >= 0.0
                             && p.y >= 0.0
                             && p.x <= view.source.width as f64 - 1.0
@@ -277,14 +277,14 @@ impl Rectification {
                     }));
                 }
             }
-            seen as f64 / all.max(1) as f64
+            valid as f64 / all.max(1) as f64
         };
-        (share(&self.left), share(&self.right))
+        (valid_fraction(&self.left), valid_fraction(&self.right))
     }
 }
 
-/// The direction from the left camera's center to the right one's, in the left one's frame, and its length; the cameras are checked.
-pub(crate) fn along_the_baseline(rig: &StereoRig) -> Result<(Vector3<f64>, f64), RectifyError> {
+/// Validates the cameras and returns the direction of the baseline in the left camera's frame, and its length.
+pub(crate) fn baseline_direction(rig: &StereoRig) -> Result<(Vector3<f64>, f64), RectifyError> {
     for (side, camera) in [("left", &rig.left), ("right", &rig.right)] {
         camera.validate().map_err(|error| RectifyError::Camera { side, error })?;
     }
@@ -293,8 +293,11 @@ pub(crate) fn along_the_baseline(rig: &StereoRig) -> Result<(Vector3<f64>, f64),
     x.map(|x| (x, baseline)).ok_or(RectifyError::NoBaseline { baseline })
 }
 
-/// Rotations of both cameras to the common frame: x along the baseline, z as near to where both look on average as can be.
-pub(crate) fn rotations(x: Vector3<f64>, relative: &Rotation3<f64>) -> Result<[Rotation3<f64>; 2], RectifyError> {
+/// Returns the rotations of both cameras to the common frame: x along the baseline, z as near as possible to the mean of the optical axes.
+pub(crate) fn common_rotations(
+    x: Vector3<f64>,
+    relative: &Rotation3<f64>,
+) -> Result<[Rotation3<f64>; 2], RectifyError> {
     let axes = [Vector3::z(), relative.inverse() * Vector3::z()];
     let turned = |side, degrees: f64| RectifyError::TooFarTurned { side, degrees, limit: MAX_TURN_DEGREES };
     let mean = axes[0] + axes[1];
@@ -320,9 +323,9 @@ pub(crate) struct Rect {
     pub(crate) bottom: f64,
 }
 
-/// The border of what a camera sees, in the rectified frame: a closed polygon, from which parts that are behind are missing.
-pub(crate) fn outline(camera: &Camera, rotation: &Rotation3<f64>) -> Vec<Point2<f64>> {
-    // As many points per side as show the bend of a strong distortion.
+/// Returns the border of a camera's field of view in the rectified frame: a closed polygon without the parts behind the camera.
+pub(crate) fn field_of_view(camera: &Camera, rotation: &Rotation3<f64>) -> Vec<Point2<f64>> {
+    // Points per side: enough for strong distortion.
     const STEPS: usize = 64;
     let (w, h) = (camera.width as f64 - 1.0, camera.height as f64 - 1.0);
     let corners = [(0.0, 0.0), (w, 0.0), (w, h), (0.0, h)];
@@ -337,10 +340,10 @@ pub(crate) fn outline(camera: &Camera, rotation: &Rotation3<f64>) -> Vec<Point2<
         .collect()
 }
 
-/// The smallest rectangle around an outline.
-pub(crate) fn around(outline: &[Point2<f64>]) -> Rect {
+/// Returns the bounding box of a polygon.
+pub(crate) fn bounding_box(polygon: &[Point2<f64>]) -> Rect {
     let nothing = Rect { left: f64::INFINITY, top: f64::INFINITY, right: -f64::INFINITY, bottom: -f64::INFINITY };
-    outline.iter().fold(nothing, |r, p| Rect {
+    polygon.iter().fold(nothing, |r, p| Rect {
         left: r.left.min(p.x),
         top: r.top.min(p.y),
         right: r.right.max(p.x),
@@ -348,16 +351,16 @@ pub(crate) fn around(outline: &[Point2<f64>]) -> Rect {
     })
 }
 
-/// The sides of a closed polygon.
-fn sides(outline: &[Point2<f64>]) -> impl Iterator<Item = (Point2<f64>, Point2<f64>)> {
-    outline.iter().copied().zip(outline.iter().copied().cycle().skip(1))
+/// Returns the sides of a closed polygon.
+fn sides(polygon: &[Point2<f64>]) -> impl Iterator<Item = (Point2<f64>, Point2<f64>)> {
+    polygon.iter().copied().zip(polygon.iter().copied().cycle().skip(1))
 }
 
-/// How far the inside of a polygon reaches from `p` to the left and right of it, or, with `axis` 1, up and down; `None` outside.
-fn reach(outline: &[Point2<f64>], p: Point2<f64>, axis: usize) -> Option<(f64, f64)> {
+/// Returns the extent of a polygon from an inside point `p` to the left and right, or, with `axis` 1, up and down; `None` outside.
+fn extent(polygon: &[Point2<f64>], p: Point2<f64>, axis: usize) -> Option<(f64, f64)> {
     let (along, across) = (axis, 1 - axis);
     let (mut before, mut behind, mut crossed) = (-f64::INFINITY, f64::INFINITY, 0);
-    for (a, b) in sides(outline) {
+    for (a, b) in sides(polygon) {
         if (a[across] > p[across]) == (b[across] > p[across]) {
             continue;
         }
@@ -373,11 +376,11 @@ fn reach(outline: &[Point2<f64>], p: Point2<f64>, axis: usize) -> Option<(f64, f
     (crossed % 2 == 1 && behind.is_finite()).then_some((before, behind))
 }
 
-/// By how much a rectangle around `middle` that reaches `half` to the sides can grow before it meets a polygon.
-fn room(outline: &[Point2<f64>], middle: Point2<f64>, half: (f64, f64)) -> f64 {
+/// Returns the factor by which a rectangle around `middle` of half size `half` can grow until it touches a polygon.
+fn max_growth(polygon: &[Point2<f64>], middle: Point2<f64>, half: (f64, f64)) -> f64 {
     let mut least = f64::INFINITY;
-    for (a, b) in sides(outline) {
-        // In units of the rectangle; along the side, the larger of both is least at an end or where they are the same.
+    for (a, b) in sides(polygon) {
+        // In units of the rectangle; along a side, the maximum norm is smallest at an end or where both coordinates are equal.
         let (u0, v0) = ((a.x - middle.x) / half.0, (a.y - middle.y) / half.1);
         let (u1, v1) = ((b.x - middle.x) / half.0, (b.y - middle.y) / half.1);
         let same = |sign: f64| (u0 - sign * v0) / ((u0 - sign * v0) - (u1 - sign * v1));
@@ -390,28 +393,28 @@ fn room(outline: &[Point2<f64>], middle: Point2<f64>, half: (f64, f64)) -> f64 {
     least
 }
 
-/// One camera for both views: between the largest that shows only what both see, and the smallest that shows all.
+/// Returns the camera of both views, between the largest that is valid in every pixel and the smallest that contains both fields of view.
 fn common_camera(
     sources: [(Camera, Rotation3<f64>); 2],
     (width, height): (usize, usize),
     alpha: f64,
 ) -> Result<Camera, RectifyError> {
-    let outlines = sources.map(|(camera, rotation)| outline(&camera, &rotation));
-    let [a, b] = [around(&outlines[0]), around(&outlines[1])];
+    let polygons = sources.map(|(camera, rotation)| field_of_view(&camera, &rotation));
+    let [a, b] = [bounding_box(&polygons[0]), bounding_box(&polygons[1])];
     let middle = |left: f64, right: f64, top: f64, bottom: f64| Point2::new((left + right) / 2.0, (top + bottom) / 2.0);
     let both = middle(a.left.max(b.left), a.right.min(b.right), a.top.max(b.top), a.bottom.min(b.bottom));
     let (left, right) = (a.left.min(b.left), a.right.max(b.right));
     let (top, bottom) = (a.top.min(b.top), a.bottom.max(b.bottom));
-    // How far both see from a point: the way to the nearer of their borders.
-    let reach_of_both = |p: Point2<f64>, axis: usize| -> Option<(f64, f64)> {
-        let ((a0, a1), (b0, b1)) = (reach(&outlines[0], p, axis)?, reach(&outlines[1], p, axis)?);
+    // The extent of the common field of view from a point.
+    let common_extent = |p: Point2<f64>, axis: usize| -> Option<(f64, f64)> {
+        let ((a0, a1), (b0, b1)) = (extent(&polygons[0], p, axis)?, extent(&polygons[1], p, axis)?);
         Some((a0.max(b0), a1.min(b1)))
     };
-    let (Some(x), Some(y)) = (reach_of_both(both, 0), reach_of_both(both, 1)) else {
+    let (Some(x), Some(y)) = (common_extent(both, 0), common_extent(both, 1)) else {
         return Err(RectifyError::NoOverlap);
     };
     let inner = Point2::new(both.x + (x.0 + x.1) / 2.0, both.y + (y.0 + y.1) / 2.0);
-    let inner = if reach_of_both(inner, 0).is_some() { inner } else { both };
+    let inner = if common_extent(inner, 0).is_some() { inner } else { both };
     // Pixel centers at the very corners.
     let (w, h) = ((width as f64 - 1.0).max(1.0), (height as f64 - 1.0).max(1.0));
     let camera = |focal: f64, middle: Point2<f64>| Camera {
@@ -423,18 +426,18 @@ fn common_camera(
         cy: (height as f64 - 1.0) / 2.0 - focal * middle.y,
         distortion: Distortion::NONE,
     };
-    let [room_a, room_b] = [0, 1].map(|i: usize| room(&outlines[i], inner, (w / 2.0, h / 2.0)));
-    let mut tight = (1.0 + ROUNDING) / room_a.min(room_b);
-    // Between the points of its outline a border bends: by less and less of a pixel, until no pixel is outside.
+    let [growth_a, growth_b] = [0, 1].map(|i: usize| max_growth(&polygons[i], inner, (w / 2.0, h / 2.0)));
+    let mut tight = (1.0 + ROUNDING) / growth_a.min(growth_b);
+    // Between the vertices the border is curved: grows the focal length until no pixel is outside.
     for _ in 0..20 {
-        let beyond = sources.map(|(source, rotation)| {
-            RectifiedView { source, camera: camera(tight, inner), rotation }.beyond_the_border()
+        let outside = sources.map(|(source, rotation)| {
+            RectifiedView { source, camera: camera(tight, inner), rotation }.max_px_outside()
         });
-        let beyond = beyond[0].max(beyond[1]);
-        if beyond <= 0.0 {
+        let outside = outside[0].max(outside[1]);
+        if outside <= 0.0 {
             break;
         }
-        tight *= 1.0 + ROUNDING + (4.0 * beyond / w.min(h)).min(0.05);
+        tight *= 1.0 + ROUNDING + (4.0 * outside / w.min(h)).min(0.05);
     }
     let wide = (w / (right - left)).min(h / (bottom - top));
     let focal = tight + (wide - tight) * alpha;
@@ -444,7 +447,7 @@ fn common_camera(
     Ok(camera(focal, inner + (middle(left, right, top, bottom) - inner) * alpha))
 }
 
-/// Of a focal length: far above what arithmetic loses, far below what a pixel shows.
+/// Relative margin of a focal length, far above rounding errors and far below a pixel.
 const ROUNDING: f64 = 1e-12;
 
 #[cfg(test)]
@@ -464,7 +467,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn a_scene_point_has_the_same_row_and_the_disparity_its_depth_says(
+        fn a_scene_point_has_the_same_row_and_the_disparity_of_its_depth(
             angles in (-0.1..0.1f64, -0.1..0.1f64, -0.1..0.1f64),
             offset in (-0.02..0.02f64, -0.02..0.02f64),
             vertical in any::<bool>(),
@@ -503,7 +506,7 @@ mod tests {
     }
 
     #[test]
-    fn alpha_0_leaves_no_hole_and_alpha_1_keeps_every_pixel() {
+    fn alpha_0_has_no_invalid_pixels_and_alpha_1_keeps_every_pixel() {
         let rig = rig((0.02, -0.03, 0.01), Vector3::new(0.1, 0.005, -0.002), -0.15);
         let tight = Rectification::new(&rig, &RectifyOptions::default()).unwrap();
         assert_eq!(tight.valid_area(), (1.0, 1.0));
@@ -519,7 +522,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rig_that_leans_shows_as_much_as_fits() {
+    fn a_tilted_rig_has_the_largest_inscribed_view() {
         let camera = Camera::from_focal(641, 481, 500.0);
         for degrees in [0.0_f64, 2.0, 10.0, 30.0, 43.0, 50.0, 80.0] {
             let (sin, cos) = degrees.to_radians().sin_cos();
@@ -540,7 +543,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pair_that_is_rectified_stays_as_it_is() {
+    fn a_rectified_pair_is_unchanged() {
         let camera = Camera::from_focal(320, 240, 300.0);
         let pose = Pose::new(Rotation3::identity(), Vector3::new(-0.1, 0.0, 0.0));
         let rig = StereoRig { left: camera, right: camera, right_from_left: pose };
@@ -551,14 +554,14 @@ mod tests {
     }
 
     #[test]
-    fn distances_are_told_as_people_read_them() {
+    fn distances_are_printed_with_four_digits() {
         let text = |distance, vertical| RectifyError::Exchanged { distance, vertical }.to_string();
-        assert_eq!(text(0.20000000000000004, true), "the second camera stands 0.2 above the first: they are exchanged");
+        assert_eq!(text(0.20000000000000004, true), "the second camera is 0.2 above the first: they are exchanged");
         assert!(text(123456.7, false).contains(" 123500 left of"));
     }
 
     #[test]
-    fn rigs_that_are_none_are_refused_with_the_reason() {
+    fn invalid_rigs_are_refused_with_the_reason() {
         let refuse =
             |angles, center| Rectification::new(&rig(angles, center, 0.0), &RectifyOptions::default()).unwrap_err();
         assert!(matches!(refuse((0.0, 0.0, 0.0), Vector3::zeros()), RectifyError::NoBaseline { baseline: 0.0 }));

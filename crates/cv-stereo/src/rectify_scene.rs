@@ -1,46 +1,47 @@
-//! Rectification of two photographs from anywhere, around the points that both are known to show.
+//! Rectification of two general views, around known scene points.
 //!
-//! A rig made for stereo has its cameras side by side, and one common camera serves both rectified views
-//! ([`Rectification::new`]). Two photographs taken by hand converge on what they show: the parts of their rectified views
-//! that have it in common then lie far apart, and each view gets a principal point of its own.
+//! A stereo rig has parallel cameras, and both rectified views share one camera ([`Rectification::new`]). Two hand-held views converge on
+//! the scene: their common field of view is then at different places of the rectified image planes, and each view has its own principal
+//! point.
 
-use crate::rectify::{Rectification, RectifiedView, RectifyError, along_the_baseline, around, outline, rotations};
+use crate::rectify::{
+    Rectification, RectifiedView, RectifyError, baseline_direction, bounding_box, common_rotations, field_of_view,
+};
 use crate::{StereoGeometry, StereoOptions};
 use cv_core::{Camera, Point3, StereoRig};
 
-/// Two rectified views, and the disparities of what they show.
+/// Two rectified views, and the search range of their disparities.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SceneRectification {
-    /// Both views. Never turned by quarters ([`Rectification::vertical`] is false): the rows of the views run along the
-    /// baseline, whichever way that lies in the photographs.
+    /// Both views. Never rotated by 90° ([`Rectification::vertical`] is false): their rows run along the baseline, whatever its direction in
+    /// the originals.
     pub views: Rectification,
     /// Smallest disparity of the scene in px, and the number of disparities.
     pub disparities: (i32, usize),
 }
 
-/// Share of the points at either end of the depths that may be wrong ones.
-const TAIL: f64 = 0.01;
+/// Fraction of the points at either end of the depths that are treated as outliers.
+const OUTLIER_FRACTION: f64 = 0.01;
 
-/// The widest angle from the axis of a rectified view that is shown: beyond, a plane image takes ten times the pixels for what it shows.
-const WIDEST_DEGREES: f64 = 70.0;
+/// Maximum angle from the optical axis of a rectified view: beyond, a perspective image needs ten times the pixels.
+const MAX_FIELD_DEGREES: f64 = 70.0;
 
 impl SceneRectification {
     /// Rectifies two views of a scene of which `points` (in the left camera's frame, in the unit of the rig) are known.
     ///
-    /// `left` is simply the first view; it may stand on either side of the other, above it or below it. The rectified views
-    /// show what both photographs do at the depths of the points, with about as many pixels as the photographs have there. The
-    /// disparities are those of the points but for one per cent at either end, and a quarter of their range and 4 px more at both
-    /// ends, for what the points miss; never beyond infinity.
+    /// `left` is the first view; it may be on any side of the other, above it or below it. The rectified views cover the common field of view
+    /// at the depths of the points, at about the resolution of the originals there. The search range is that of the points without one
+    /// percent at either end, extended by a quarter of itself and 4 px at both ends, and never beyond infinity.
     ///
     /// # Errors
-    /// [`RectifyError`] with the reason why it cannot be done: [`RectifyError::TooFarTurned`] where one camera stands more or less ahead of
-    /// the other, [`RectifyError::NoOverlap`] where no point is in front of both rectified cameras.
+    /// [`RectifyError`] with the reason: [`RectifyError::TooFarTurned`] for motion along the optical axis, [`RectifyError::NoOverlap`] if no
+    /// point is in front of both rectified cameras.
     pub fn new(rig: &StereoRig, points: &[Point3<f64>]) -> Result<Self, RectifyError> {
-        let (x, baseline) = along_the_baseline(rig)?;
+        let (x, baseline) = baseline_direction(rig)?;
         let pose = &rig.right_from_left;
-        let rotations = rotations(x, &pose.rotation)?;
+        let rotations = common_rotations(x, &pose.rotation)?;
 
-        // What the points look like to the rectified views: inverse depth, and how much larger the views show them than the photographs do.
+        // Of each point the inverse depth, and the scale of the rectified views relative to the originals.
         let mut inverse = Vec::new();
         let mut growth = Vec::new();
         for p in points {
@@ -50,7 +51,7 @@ impl SceneRectification {
                 continue;
             }
             inverse.push(1.0 / common.z);
-            // A central projection shows a solid angle at the angle θ from its axis with an area of 1 / cos³ θ; both distances are the point's.
+            // A perspective projection maps a solid angle at the angle θ from its axis to an area of 1 / cos³ θ; the distance of the point cancels.
             growth.push((p.z / common.z).powi(3).sqrt() / rig.left.fx);
             growth.push((q.z / common.z).powi(3).sqrt() / rig.right.fx);
         }
@@ -60,15 +61,16 @@ impl SceneRectification {
         inverse.sort_unstable_by(f64::total_cmp);
         growth.sort_unstable_by(f64::total_cmp);
         let focal = 1.0 / growth[growth.len() / 2];
-        let at = |share: f64| inverse[((inverse.len() - 1) as f64 * share).round() as usize];
+        let at = |fraction: f64| inverse[((inverse.len() - 1) as f64 * fraction).round() as usize];
         // Normalized disparities: baseline over depth.
-        let (low, high) = (baseline * at(TAIL), baseline * at(1.0 - TAIL));
-        let more = 0.25 * (high - low) + 4.0 / focal;
-        let (low, high) = ((low - more).max(0.0), high + more);
+        let (low, high) = (baseline * at(OUTLIER_FRACTION), baseline * at(1.0 - OUTLIER_FRACTION));
+        let margin = 0.25 * (high - low) + 4.0 / focal;
+        let (low, high) = ((low - margin).max(0.0), high + margin);
 
-        let widest = WIDEST_DEGREES.to_radians().tan();
-        let [a, b] = [around(&outline(&rig.left, &rotations[0])), around(&outline(&rig.right, &rotations[1]))];
-        let clip = |v: f64| v.clamp(-widest, widest);
+        let max_tangent = MAX_FIELD_DEGREES.to_radians().tan();
+        let [a, b] = [(&rig.left, &rotations[0]), (&rig.right, &rotations[1])]
+            .map(|(camera, rotation)| bounding_box(&field_of_view(camera, rotation)));
+        let clip = |v: f64| v.clamp(-max_tangent, max_tangent);
         let (top, bottom) = (clip(a.top.max(b.top)), clip(a.bottom.min(b.bottom)));
         // A point at x in the left view is at x − d in the right one.
         let (left_a, right_a) = (clip(a.left.max(b.left + low)), clip(a.right.min(b.right + high)));
@@ -91,7 +93,7 @@ impl SceneRectification {
         Ok(Self { views, disparities: (first as i32, (last - first) as usize + 1) })
     }
 
-    /// Options of a matcher for these views: the disparities of the scene, and nothing filled in.
+    /// Returns options of a matcher for these views: the search range, without filling.
     pub fn stereo_options(&self) -> StereoOptions {
         let (min_disparity, disparities) = self.disparities;
         StereoOptions { min_disparity, disparities, fill: false, ..StereoOptions::default() }
@@ -112,7 +114,7 @@ mod tests {
         StereoRig { left, right, right_from_left: Pose::new(rotation, -(rotation * center)) }
     }
 
-    /// Points that both cameras see.
+    /// Points visible in both cameras.
     fn points(rig: &StereoRig) -> Vec<Point3<f64>> {
         let inside = |camera: &Camera, p: &Point3<f64>| {
             camera.project(p).is_some_and(|q| {
@@ -129,10 +131,10 @@ mod tests {
 
     proptest! {
         #[test]
-        fn scene_points_have_the_same_row_and_the_disparity_their_depth_says(
+        fn scene_points_have_the_same_row_and_the_disparity_of_their_depth(
             angles in (-0.1..0.1f64, -0.1..0.1f64, -1.5..1.5f64), way in 0.0..std::f64::consts::TAU, ahead in -0.3..0.3f64,
         ) {
-            // Any direction across the line of sight, and turned together with it or against it.
+            // Any direction of the baseline across the optical axis, and any rotation.
             let rig = rig([angles.0, angles.1, angles.2], Vector3::new(way.cos(), way.sin(), ahead));
             let points = points(&rig);
             prop_assume!(points.len() > 200);
@@ -153,19 +155,19 @@ mod tests {
                 let d = a.x - b.x - f64::from(min);
                 outside += usize::from(!(shown(a, &views.left.camera) && shown(b, &views.right.camera) && d >= 0.0 && d < n as f64));
             }
-            // All but the one per cent at either end is inside, and the margins take most of that.
+            // All but one percent at either end are inside, and the margins contain most of those.
             prop_assert!(outside <= points.len() / 50, "{outside} of {}", points.len());
         }
     }
 
     #[test]
-    fn a_point_is_shown_about_as_large_as_in_the_photographs() {
+    fn the_scale_of_the_views_is_that_of_the_originals() {
         let rig = rig([0.0, 0.3, 0.0], Vector3::new(-1.0, 0.2, 0.1));
         let all = points(&rig);
         let found = SceneRectification::new(&rig, &all).unwrap();
         let area = |camera: &dyn Fn(&Point3<f64>) -> cv_core::Point2<f64>, p: &Point3<f64>| {
             let h = 1e-4;
-            // Turned about the camera: along the two directions across the ray.
+            // Along two directions perpendicular to the ray.
             let across = p.coords.cross(&Vector3::y()).normalize();
             let other = p.coords.cross(&across).normalize();
             let (u, v) = (camera(&(p + across * h)) - camera(p), camera(&(p + other * h)) - camera(p));
@@ -180,13 +182,13 @@ mod tests {
             })
             .collect();
         ratios.sort_by(f64::total_cmp);
-        // The median over both views is one; the left one's differs by how differently the two look at the scene, and by the lens.
+        // The median over both views is one; that of the left one differs by the viewing directions and the distortion.
         let median = ratios[ratios.len() / 2];
         assert!((0.8..1.25).contains(&median), "{median}");
     }
 
     #[test]
-    fn what_cannot_be_rectified_is_refused_with_the_reason() {
+    fn invalid_scenes_are_refused_with_the_reason() {
         let get = |center, points: &[Point3<f64>]| SceneRectification::new(&rig([0.0; 3], center), points).unwrap_err();
         let point = [Point3::new(0.0, 0.0, 5.0)];
         assert!(
@@ -197,7 +199,7 @@ mod tests {
         assert!(matches!(get(Vector3::x(), &[]), RectifyError::NoOverlap));
         assert!(matches!(get(Vector3::x(), &[Point3::new(0.0, 0.0, -5.0)]), RectifyError::NoOverlap));
         assert!(matches!(get(Vector3::x(), &[Point3::new(f64::NAN, 0.0, f64::NAN)]), RectifyError::NoOverlap));
-        // One point alone has no range: the margin is all there is.
+        // One point has an empty range: only the margin remains.
         let found = SceneRectification::new(&rig([0.0; 3], Vector3::x()), &point).unwrap();
         assert!((9..=12).contains(&found.disparities.1), "{:?}", found.disparities);
     }

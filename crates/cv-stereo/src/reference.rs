@@ -1,10 +1,10 @@
-//! Reference implementation of semi-global matching, with whole cost volumes: what the fast matcher must equal.
+//! Reference implementation of semi-global matching with whole cost volumes, which the fast matcher must equal.
 
 use crate::coarse_prior::Prior;
 use crate::winner::{NO_SUM, Winner, outside_cost, p2_table};
 use crate::{IntensityCost, Paths, StereoOptions};
 
-/// Winners of the left image and indices of the right one's, row by row.
+/// Returns the winners of the left image and the winning indices of the right one, in raster order.
 pub(crate) fn match_reference(
     options: &StereoOptions,
     gray: &[u16],
@@ -27,16 +27,16 @@ pub(crate) fn match_reference(
         };
         (left[i] ^ right[j]).count_ones() as u8 + more.min(options.intensity_cost.cap())
     };
-    let guided = |i: usize, k: usize| {
-        let away =
+    let prior_cost = |i: usize, k: usize| {
+        let cost =
             |prior: &Prior| usize::from(prior.index).abs_diff(k).saturating_sub(1).min(usize::from(prior.cap)) as u8;
-        priors.get(i).map_or(0, away)
+        priors.get(i).map_or(0, cost)
     };
     let costs: Vec<u8> = (0..width * height)
         .flat_map(|i| {
             let (x, row) = (i % width, i / width * width);
             let inside: Vec<Option<u8>> =
-                (0..n).map(|k| column(x, k).map(|xr| bits(i, row + xr) + guided(i, k))).collect();
+                (0..n).map(|k| column(x, k).map(|xr| bits(i, row + xr) + prior_cost(i, k))).collect();
             let known = inside.iter().flatten();
             let outside = outside_cost(known.clone().map(|&c| u32::from(c)).sum(), known.count());
             inside.into_iter().map(move |cost| cost.unwrap_or(outside)).collect::<Vec<_>>()
@@ -49,7 +49,7 @@ pub(crate) fn match_reference(
         Paths::Four => &[(-1, 0), (0, -1), (1, 0), (0, 1)],
         Paths::Eight => &[(-1, 0), (-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1)],
     };
-    // Two halves, each of which saturates.
+    // The sums of both sweeps, each of which saturates.
     let mut halves = [vec![0u16; width * height * n], vec![0u16; width * height * n]];
     let mut path = vec![0u32; width * height * n];
     for (number, &(dx, dy)) in directions.iter().enumerate() {
@@ -69,16 +69,16 @@ pub(crate) fn match_reference(
                     let step = (gray[y * width + x] >> 8).abs_diff(gray[py * width + px] >> 8);
                     let p2 = u32::from(table[usize::from(step)]);
                     let before: Vec<u32> = path[(py * width + px) * n..][..n].to_vec();
-                    let least = before.iter().copied().min().unwrap_or(0);
+                    let smallest = before.iter().copied().min().unwrap_or(0);
                     for k in 0..n {
-                        let mut best = before[k].min(least + p2);
+                        let mut best = before[k].min(smallest + p2);
                         if k > 0 {
                             best = best.min(before[k - 1] + p1);
                         }
                         if k + 1 < n {
                             best = best.min(before[k + 1] + p1);
                         }
-                        path[here + k] = cost(x, y, k) + best - least;
+                        path[here + k] = cost(x, y, k) + best - smallest;
                     }
                 }
                 for k in 0..n {
@@ -130,7 +130,7 @@ mod tests {
     use proptest::prelude::*;
 
     /// Census bits by definition.
-    fn census_plain(gray: &[u16], width: usize, height: usize, window: Census) -> Vec<u64> {
+    fn census_reference(gray: &[u16], width: usize, height: usize, window: Census) -> Vec<u64> {
         let (w, h) = window.size();
         let at = |x: i64, y: i64| {
             gray[y.clamp(0, height as i64 - 1) as usize * width + x.clamp(0, width as i64 - 1) as usize]
@@ -153,7 +153,7 @@ mod tests {
             .collect()
     }
 
-    /// What the intensity_cost compares, by definition.
+    /// What the intensity cost compares, by definition.
     fn intensity_reference(gray: &[u16], width: usize, intensity_cost: IntensityCost) -> Vec<u8> {
         let value = |i: usize| {
             let at = |x: usize| i32::from(gray[i / width * width + x]);
@@ -211,12 +211,12 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(48))]
         #[test]
-        fn the_fast_matcher_is_the_plain_one_on_every_instruction_set(
+        fn the_fast_matcher_equals_the_reference_on_every_instruction_set(
             options in options(),
             width in 9usize..40,
             height in 7usize..16,
             seed in any::<u64>(),
-            guided in any::<bool>(),
+            has_priors in any::<bool>(),
             levels_of_gray in prop_oneof![Just(2u16), Just(5), Just(200)],
         ) {
             options.validate().unwrap();
@@ -229,10 +229,10 @@ mod tests {
             };
             let left: Vec<u16> = (0..width * height).map(noise).collect();
             let right: Vec<u16> = (0..width * height).map(|i| noise(if i % 5 == 0 { i + 7 } else { i + 3 })).collect();
-            let bits = [&left, &right].map(|g| census_plain(g, width, height, options.census));
+            let bits = [&left, &right].map(|g| census_reference(g, width, height, options.census));
             let blended = [&left, &right].map(|g| intensity_reference(g, width, options.intensity_cost));
             let prior = |i: usize| Prior { index: (noise(i + 11) as usize * 31 % disparities) as u16, cap: (noise(i + 5) % 4) as u8 };
-            let priors: Vec<Prior> = if guided { (0..width * height).map(prior).collect() } else { Vec::new() };
+            let priors: Vec<Prior> = if has_priors { (0..width * height).map(prior).collect() } else { Vec::new() };
             let expected = match_reference(&options, &left, [&bits[0], &bits[1]], &blended, &priors, width, height);
 
             let gray = [padded(&left, width, height), padded(&right, width, height)];
@@ -253,7 +253,7 @@ mod tests {
                     p1: options.p1, p2: &p2, second: options.confidence,
                 };
                 let mut aggregator = Aggregator::default();
-                // Twice, so that what a frame leaves behind would show.
+                // Twice, so that state left by a frame would show.
                 for _ in 0..2 {
                     let stage = cv_core::Stage::new(&cv_core::Silent, "", 0).unwrap();
                     aggregator.run(level, &frame, options.paths == Paths::Eight, &stage).unwrap();

@@ -1,8 +1,8 @@
-//! The winners of both views, from the sums of a pixel while they are at hand.
+//! Winner-takes-all selection in both views, from the sums of a pixel while they are in registers.
 //!
-//! A sum and its index share a 16-bit key, so that the least key is the first of the least sums. The candidates of a pixel
-//! of the right image are met pixel by pixel of the left one, each time one index further: the best keys so far are held
-//! in vectors that move along by one index a pixel, and what leaves at the end is decided.
+//! A sum and its index share a 16-bit key, so that the smallest key is the first of the smallest sums. The candidates of a pixel of the
+//! right image are those of successive pixels of the left one at successive indices: the best keys so far are kept in vectors that shift
+//! by one index per pixel, and the key that is shifted out is final.
 
 use crate::aligned_buffer::AlignedBuffer;
 use crate::cost::Frame;
@@ -12,18 +12,16 @@ use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
 use std::ops::Range;
 
-/// Bits of a key that hold the index within a group.
+/// Bits of a key for the index within a group.
 const KEY_BITS: u32 = 7;
 const INDEX: u16 = (1 << KEY_BITS) - 1;
 
 /// State of the selection, kept between frames.
 #[derive(Debug, Default)]
 pub(crate) struct Selection {
-    /// Best keys of the right pixels that the current pixel looks at. Vector `r` of the `2n` of a group holds indices
-    /// `2n·l + r`.
+    /// Best keys of the right pixels that are candidates of the current pixel. Vector `r` of the `2n` of a group has indices `2n·l + r`.
     running: AlignedBuffer<u16>,
-    /// Best keys of the right pixels that are decided, group by group: at `x + group − 1 − k` that of the pixel which `x`
-    /// looks at with index `k`.
+    /// Final keys of the right pixels, group by group: at `x + group − 1 − k` that of the candidate of `x` at index `k`.
     decided: Vec<u16>,
 }
 
@@ -38,12 +36,12 @@ impl Selection {
         self.decided.resize(layout.groups() * (frame.width + layout.group), 0);
     }
 
-    /// Prepares for a row.
+    /// Resets the state for a row.
     pub(crate) fn start(&mut self) {
         self.running.as_mut_slice().fill(u16::MAX);
     }
 
-    /// What the columns `xs` need.
+    /// Returns the buffers of the columns `xs`.
     pub(crate) fn ends<'a>(
         &'a mut self,
         frame: &Frame<'_>,
@@ -73,10 +71,10 @@ impl Selection {
                 decided[x + group - 1 - k] = running[place(k, group, lanes)];
             }
         }
-        // Where the key of column 0 lies in the first group.
+        // Index of the key of column 0 in the first group.
         let first = frame.min_disparity + group as i64 - 1;
         if frame.layout.groups() == 1 {
-            // Columns that some pixel looks at.
+            // Columns that are a candidate of some pixel.
             let start = (-first).clamp(0, frame.width as i64) as usize;
             let end = ((stride - 1) as i64 - first).clamp(start as i64, frame.width as i64) as usize;
             out[..start].fill(0);
@@ -104,19 +102,19 @@ impl Selection {
     }
 }
 
-/// What picks the winners of some pixels.
+/// Buffers of the selection of some pixels.
 pub(crate) struct Ends<'a> {
     /// Sums of the other sweep.
     pub(crate) other: &'a [u8],
     pub(crate) running: &'a mut [u16],
     pub(crate) decided: &'a mut [u16],
-    /// From group to group of the decided ones.
+    /// Stride of the groups of `decided`.
     pub(crate) stride: usize,
-    /// The least sum and its index.
+    /// The smallest sum and its index.
     pub(crate) best: &'a mut [(u16, u16)],
 }
 
-/// The winners of some pixels.
+/// Writes the winners of some pixels.
 #[simd]
 pub(crate) fn select<S: Simd, const BLOCKS: usize, const SINGLE: bool>(
     simd: S,
@@ -134,24 +132,24 @@ pub(crate) fn select<S: Simd, const BLOCKS: usize, const SINGLE: bool>(
 
 /// The keys of a group at one pixel.
 pub(crate) struct Keys<S: Simd> {
-    /// What the vectors before the next two held before this pixel.
+    /// Old keys of the two vectors before the next two.
     even: S::u16s,
     odd: S::u16s,
-    /// What vectors `0` and `n` held before this pixel.
+    /// Old keys of vectors `0` and `n`.
     first: S::u16s,
     middle: S::u16s,
-    /// The least keys so far.
+    /// The smallest keys so far.
     best: S::u16s,
 }
 
-/// Vector `r` of some.
+/// Loads vector `r`.
 #[inline(always)]
 fn vector<S: Simd>(simd: S, of: &[u16], r: usize) -> S::u16s {
     S::u16s::from_slice(simd, &of[r * S::u16s::LEN..][..S::u16s::LEN])
 }
 
 impl<S: Simd> Keys<S> {
-    /// Begins with group of `n` vectors.
+    /// Starts a group of `n` vectors.
     #[inline(always)]
     pub(crate) fn begin(simd: S, running: &[u16], n: usize) -> Self {
         let none = S::u16s::splat(simd, u16::MAX);
@@ -165,7 +163,7 @@ impl<S: Simd> Keys<S> {
         Self { even, odd: vector(simd, running, n - 1), first, middle, best: none }
     }
 
-    /// Adds the sums of both sweeps at vector `v` of `n`. `ids` are the indices that vectors of keys hold.
+    /// Adds the sums of both sweeps at vector `v` of `n`. `ids` are the indices of the vectors of keys.
     #[inline(always)]
     pub(crate) fn add<const KEYS: usize>(
         &mut self,
@@ -176,7 +174,7 @@ impl<S: Simd> Keys<S> {
         v: usize,
         n: usize,
     ) {
-        // Bytes in even places, and those in odd ones.
+        // Bytes at even positions, and at odd ones.
         let [own, other] = [own.bitcast::<S::u16s>(), other.bitcast::<S::u16s>()];
         let low = S::u16s::splat(simd, 0xff);
         let even = (((own & low) + (other & low)) << KEY_BITS) | ids[v];
@@ -195,7 +193,7 @@ impl<S: Simd> Keys<S> {
         before_odd.min(odd).store_slice(&mut running[(n + v) * S::u16s::LEN..][..S::u16s::LEN]);
     }
 
-    /// The least sum and its index, of this group, whose first index is `start`, or `best` of those before.
+    /// Returns the smallest sum and its index, of this group, whose first index is `start`, or `best` of the previous ones.
     #[inline(always)]
     pub(crate) fn end(&self, best: (u16, u16), start: usize) -> (u16, u16) {
         let key = self.best.reduce_min();
@@ -203,7 +201,7 @@ impl<S: Simd> Keys<S> {
     }
 }
 
-/// The indices that vectors of keys hold, of `n` vectors of sums per group.
+/// Returns the indices of the vectors of keys, for `n` vectors of sums per group.
 #[inline(always)]
 pub(crate) fn ids<S: Simd>(simd: S, n: usize) -> [S::u16s; 2 * MAX_VECTORS] {
     let first = S::u16s::from_fn(simd, |lane| (lane * 2 * n) as u16);
@@ -214,7 +212,7 @@ pub(crate) fn ids<S: Simd>(simd: S, n: usize) -> [S::u16s; 2 * MAX_VECTORS] {
     ids
 }
 
-/// The winner with its surroundings, given the sums of both sweeps.
+/// Returns the winner with the sums around it, given the sums of both sweeps.
 #[inline(always)]
 fn surroundings<S: Simd>(
     simd: S,
@@ -240,7 +238,7 @@ fn surroundings<S: Simd>(
     Winner { index, cost, second, below, above }
 }
 
-/// The smallest sum that is not next to the winner.
+/// Returns the smallest sum that is not next to the winner.
 #[inline(always)]
 fn second<S: Simd>(simd: S, group: usize, index: u16, own: &[u8], other: &[u8]) -> u16 {
     let n = group / S::u8s::LEN;

@@ -1,10 +1,10 @@
 //! Semi-global aggregation (Hirschmüller, "Stereo processing by semiglobal matching and mutual information", PAMI 2008)
 //! in two sweeps that meet in the middle.
 //!
-//! One sweep goes down from the top left, the other up from the bottom right, at the same time on two cores. Until they
-//! meet each stores its sums; beyond, each adds the other's sums to its own and picks the winners there and then. So
-//! the volume of sums is written once and read once, costs are computed from the census bits where they are needed,
-//! and no two threads ever write to the same memory.
+//! One sweep goes down from the top left, the other up from the bottom right, in parallel. Until they meet, each stores its sums; then
+//! each adds the other's sums to its own and selects the winners immediately. The volume of sums is so written once and read once, costs
+//! are computed from the census bits on the fly, and no two threads write to the same memory. With more than two threads, others
+//! compute the costs of the next row of each sweep.
 
 use crate::aligned_buffer::AlignedBuffer;
 use crate::cost::Frame;
@@ -16,7 +16,7 @@ use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Buffers of the aggregation, kept between frames.
+/// Buffers of the aggregation, reused between frames.
 #[derive(Debug, Default)]
 pub(crate) struct Aggregator {
     sums: AlignedBuffer<u8>,
@@ -26,7 +26,7 @@ pub(crate) struct Aggregator {
 }
 
 impl Aggregator {
-    /// Bytes for images of this size.
+    /// Returns the bytes for images of this size.
     pub(crate) fn bytes(width: usize, height: usize, layout: Layout) -> usize {
         let pixels = width.saturating_mul(height);
         pixels
@@ -40,7 +40,7 @@ impl Aggregator {
         self.right.resize(width * height, 0);
     }
 
-    /// Asks for the memory of a frame and touches every page of it.
+    /// Allocates the memory of a frame and touches every page of it.
     pub(crate) fn prepare(
         &mut self,
         width: usize,
@@ -58,7 +58,7 @@ impl Aggregator {
         })
     }
 
-    /// Fills [`Aggregator::winners`] and [`Aggregator::right`]. Twice as many units as rows.
+    /// Computes [`Aggregator::winners`] and [`Aggregator::right`]. Reports two units of progress per row.
     pub(crate) fn run(
         &mut self,
         level: Level,
@@ -105,7 +105,7 @@ impl Aggregator {
     }
 }
 
-/// Runs a sweep over some rows, counted in its own sense, for which `output` is.
+/// Runs a sweep over some rows, in its own order; `output` has the same rows.
 pub(crate) fn sweep(
     level: Level,
     frame: &Frame<'_>,

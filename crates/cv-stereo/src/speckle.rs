@@ -1,19 +1,19 @@
-//! Removal of small patches that agree only with themselves.
+//! Speckle filter: removal of small connected components of similar disparity.
 
 use crate::PixelState;
 use cv_core::UnionFind;
 use rayon::prelude::*;
 
-/// Rows per strip: strips are labeled side by side, then joined. Small enough to occupy every core.
+/// Rows per strip: strips are labeled in parallel, then merged. Small enough to occupy every core.
 const STRIP: usize = 64;
 
-/// Memory of [`remove_speckles`], kept between frames.
+/// Buffers of [`remove_speckles`], reused between frames.
 #[derive(Debug, Default)]
 pub(crate) struct Speckles {
     strips: Vec<Strip>,
-    /// Which runs are of one patch.
-    patches: UnionFind,
-    /// Pixels of each run, later of each patch.
+    /// Components of runs.
+    components: UnionFind,
+    /// Pixels of each run, later of its component.
     sizes: Vec<u32>,
 }
 
@@ -21,14 +21,14 @@ pub(crate) struct Speckles {
 #[derive(Debug, Default)]
 struct Strip {
     runs: Vec<Run>,
-    /// Where the runs of the last row begin, and where those of the first one end.
+    /// Start of the runs of the last row, and end of those of the first one.
     last: usize,
     first_end: usize,
-    /// Which runs are of one patch, counted from the first of the strip.
-    patches: UnionFind,
+    /// Components of the runs of the strip.
+    components: UnionFind,
 }
 
-/// Pixels beside each other of one surface: columns `start` to `end` of a row.
+/// A run of pixels of similar disparity: columns `start` to `end` of a row.
 #[derive(Debug, Clone, Copy)]
 struct Run {
     y: u32,
@@ -36,17 +36,17 @@ struct Run {
     end: u32,
 }
 
-/// Sets to NaN, and from matched to mismatched, every 4-connected patch of at most `max_size` pixels whose neighbors differ by no
-/// more than `range`.
+/// Sets every 4-connected component of at most `max_size` pixels, whose neighbors differ by no more than `range`, to NaN, and its matched
+/// pixels to mismatched.
 ///
-/// Runs of each row are joined by union-find, counted, and the small patches cleared: linear in the number of pixels.
+/// The runs of each row are merged by union-find, counted, and small components cleared: linear in the number of pixels.
 pub(crate) fn remove_speckles(
     disparity: &mut [f32],
     states: &mut [PixelState],
     width: usize,
     max_size: usize,
     range: f32,
-    Speckles { strips, patches, sizes }: &mut Speckles,
+    Speckles { strips, components, sizes }: &mut Speckles,
 ) {
     if width == 0 || max_size == 0 || disparity.is_empty() {
         return;
@@ -54,11 +54,11 @@ pub(crate) fn remove_speckles(
     let strip = width * STRIP;
     strips.resize_with(disparity.len().div_ceil(strip), Strip::default);
     strips.par_iter_mut().zip(disparity.par_chunks(strip)).for_each(|(runs, rows)| runs.label(rows, width, range));
-    patches.clear();
+    components.clear();
     sizes.clear();
     for (number, here) in strips.iter().enumerate() {
-        let offset = patches.len() as u32;
-        patches.append(&here.patches);
+        let offset = components.len() as u32;
+        components.append(&here.components);
         sizes.extend(here.runs.iter().map(|run| run.end - run.start));
         if number > 0 {
             let above = &strips[number - 1];
@@ -69,10 +69,10 @@ pub(crate) fn remove_speckles(
                 runs: &above.runs[above.last..],
                 first: offset - (above.runs.len() - above.last) as u32,
             };
-            join_rows(last, Row { row, runs: &here.runs[..here.first_end], first: offset }, range, patches);
+            merge_rows(last, Row { row, runs: &here.runs[..here.first_end], first: offset }, range, components);
         }
     }
-    let roots = patches.flatten();
+    let roots = components.flatten();
     for (run, &root) in roots.iter().enumerate() {
         if root as usize != run {
             sizes[root as usize] += sizes[run];
@@ -97,9 +97,9 @@ pub(crate) fn remove_speckles(
 
 impl Strip {
     fn label(&mut self, disparity: &[f32], width: usize, range: f32) {
-        let Self { runs, last, first_end, patches } = self;
+        let Self { runs, last, first_end, components } = self;
         runs.clear();
-        patches.clear();
+        components.clear();
         let mut above = 0..0;
         for (y, row) in disparity.chunks_exact(width).enumerate() {
             let first = runs.len();
@@ -114,7 +114,7 @@ impl Strip {
                     x += 1;
                 }
                 if !before.is_nan() {
-                    patches.push();
+                    components.push();
                     runs.push(Run { y: y as u32, start: start as u32, end: x as u32 });
                 }
             }
@@ -123,7 +123,7 @@ impl Strip {
             } else {
                 let up = &disparity[(y - 1) * width..y * width];
                 let up = Row { row: up, runs: &runs[above.clone()], first: above.start as u32 };
-                join_rows(up, Row { row, runs: &runs[first..], first: first as u32 }, range, patches);
+                merge_rows(up, Row { row, runs: &runs[first..], first: first as u32 }, range, components);
             }
             *last = first;
             above = first..runs.len();
@@ -131,23 +131,23 @@ impl Strip {
     }
 }
 
-/// A row, its runs, and the number of the first one.
+/// A row, its runs, and the index of the first one.
 struct Row<'a> {
     row: &'a [f32],
     runs: &'a [Run],
     first: u32,
 }
 
-/// Joins the runs of two rows that touch where the disparities agree.
-fn join_rows(up: Row<'_>, here: Row<'_>, range: f32, patches: &mut UnionFind) {
+/// Merges the runs of two rows that touch at pixels of similar disparity.
+fn merge_rows(up: Row<'_>, here: Row<'_>, range: f32, components: &mut UnionFind) {
     let mut next = 0;
     for (i, run) in here.runs.iter().enumerate() {
         while let Some(above) = up.runs.get(next).filter(|above| above.start < run.end) {
-            let shared = run.start.max(above.start) as usize..run.end.min(above.end) as usize;
-            // Empty where the one above ends before this one starts.
-            let mut pixels = shared.map(|x| (up.row[x] - here.row[x]).abs());
+            let overlap = run.start.max(above.start) as usize..run.end.min(above.end) as usize;
+            // Empty if the one above ends before this one starts.
+            let mut pixels = overlap.map(|x| (up.row[x] - here.row[x]).abs());
             if pixels.any(|difference| difference <= range) {
-                patches.union(up.first + next as u32, here.first + i as u32);
+                components.union(up.first + next as u32, here.first + i as u32);
             }
             if above.end > run.end {
                 break;
@@ -167,7 +167,7 @@ mod tests {
         disparity.iter().map(|d| if d.is_nan() { PixelState::OutOfView } else { PixelState::Matched }).collect()
     }
 
-    /// The definition: flood fill from every pixel.
+    /// Reference: flood fill from every pixel.
     fn plain(disparity: &[f32], width: usize, max_size: usize, range: f32) -> Vec<bool> {
         (0..disparity.len())
             .map(|start| {
@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn patches_reach_across_strips() {
+    fn components_extend_across_strips() {
         // A column of nines through four strips, one pixel wide, and a short one across a joint.
         let (width, height) = (5, 3 * STRIP + 7);
         let mut d: Vec<f32> = vec![0.0; width * height];
@@ -224,7 +224,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_stays_is_what_a_flood_fill_keeps(
+        fn the_filter_equals_a_flood_fill(
             width in 1usize..9,
             values in proptest::collection::vec(prop_oneof![4 => (0..4i32).prop_map(|v| v as f32), 1 => Just(f32::NAN)], 0..72),
             max_size in 1usize..8,

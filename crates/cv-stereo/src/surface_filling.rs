@@ -1,13 +1,14 @@
-//! Disparities for pixels that have none of their own: the surfaces around are continued into holes, as slanted planes, and each cell of a
-//! hole is of the surface that explains best why nothing was matched there.
+//! Hole filling: the surrounding surfaces are extrapolated into holes as slanted planes, and each cell of a hole is assigned the surface that
+//! best explains why it was not matched.
 //!
-//! The cost of a plane at a pixel knows the three causes. A pixel whose partner lies outside the right photograph, or is hidden behind
-//! something nearer that the right camera sees there, may be anything; one whose partner is seen ought to look like it; and one that would
-//! hide from the right camera what it is known to see is impossible. Planes reach cells along the shortest paths through the photograph,
-//! where its edges make the way longer; then cells take over the planes of their neighbors where that costs less (iterated conditional
-//! modes; Besag, JRSS B 1986, with planes as labels as in Bleyer, Rhemann & Rother, "PatchMatch stereo", BMVC 2011).
+//! The data term of a plane at a pixel models the three causes. A pixel that is out of view, or occluded by a nearer match of the right
+//! image, has a constant cost; a visible one has the dissimilarity of its correspondence; and one that would occlude a match of the right
+//! image is penalized. Labels are propagated along geodesic paths, which image edges lengthen; then iterated conditional modes (Besag, JRSS
+//! B 1986) replace the plane of a cell by that of a neighbor if the energy decreases (planes as labels: Bleyer, Rhemann & Rother,
+//! "PatchMatch stereo", BMVC 2011).
 
 use crate::PixelState;
+use crate::fill_uncertainty::Extrapolation;
 use crate::layout::Layout;
 use crate::surfaces::{CELL, NONE, Plane, Surfaces, center, extent, neighbors};
 use crate::winner::Winner;
@@ -18,68 +19,74 @@ use rayon::prelude::*;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
-// Set with the constants of `surfaces`; half and twice of each differ by 0.1 points of the pixels that are wrong by more than 2 px.
-/// What a pixel costs that nobody else sees: outside the right photograph, and behind what is seen there. One that is seen costs 0 to 1.
-const OUTSIDE: f32 = 0.45;
-const HIDDEN: f32 = 0.4;
-/// What one costs that would hide what the right camera sees, by more than so many px.
-const HIDES: f32 = 2.0;
-const MARGIN: f32 = 1.5;
-/// Gray levels a step at which half of what the two photographs say of a pixel is believed.
-const TEXTURE: f32 = 3.0;
-/// Differing bits of a chance match.
-const CHANCE: f32 = 0.5;
-/// Weight of a matched pixel of the cell that is not on the plane, per px up to 2, and of a match that failed a check.
-const MATCHED: f32 = 0.5;
-const FAILED: f32 = 0.1;
-/// Gap in px between the planes of neighbors at which its cost has fully grown, and that cost.
-const GAP: f32 = 4.0;
-const BREAK: f32 = 8.0;
-/// Gray levels between cells at which a break between them costs half, and that make the way twice as long.
-const EDGE: f32 = 8.0;
-/// Length of the way that a cell's cost counts for.
-const WAY: f32 = 0.1;
-/// Passes over the cells, down and up.
+// Set with the constants of `surfaces`; half and twice of each differ by 0.1 points of the errors above 2 px.
+/// Costs of out-of-view and of occluded pixels. A visible one costs 0 to 1.
+const OUT_OF_VIEW_COST: f32 = 0.45;
+const OCCLUDED_COST: f32 = 0.4;
+/// Cost of a pixel that would occlude a match of the right image, and the difference in px from which it is in front.
+const OCCLUDING_COST: f32 = 2.0;
+const OCCLUSION_STEP: f32 = 1.5;
+/// Texture in gray levels at which the dissimilarity of a pixel has half its weight.
+const HALF_TEXTURE: f32 = 3.0;
+/// Fraction of differing census bits of a chance match.
+const CHANCE_BITS: f32 = 0.5;
+/// Weight of the distance of a plane from a matched pixel, per px up to 2, and from a rejected match.
+const MATCH_WEIGHT: f32 = 0.5;
+const REJECTED_WEIGHT: f32 = 0.1;
+/// Smoothness term: its maximum, and the distance in px between the planes of neighbors at which it is reached.
+const SMOOTHNESS: f32 = 8.0;
+const MAX_DISTANCE: f32 = 4.0;
+/// Difference in gray levels of neighboring cells that halves the smoothness term and doubles the geodesic distance.
+const EDGE_GRAY: f32 = 8.0;
+/// Number of cells of a surface from which geodesic distances have scale 1, and the range of the scale. Half and twice of each differ by 0.1
+/// points of the errors above 2 px; without the scale Middlebury's Vintage has 17 % of errors above 2 px in place of 10.
+const REFERENCE_SIZE: f32 = 64.0;
+const DISTANCE_SCALE_RANGE: (f32, f32) = (0.25, 2.0);
+/// Weight of the data term of a cell in the geodesic distance.
+const PATH_COST_WEIGHT: f32 = 0.1;
+/// Passes of iterated conditional modes, down and up.
 const PASSES: usize = 2;
-/// Gray levels by which a pixel differs from a cell of its surface at the most that counts.
-const ALIKE: f32 = 32.0;
-/// Weight of the photographs against that.
-const SEEN: f32 = 2.0;
-/// Planes that lie nearer than this to each other over a cell, in px, are one there.
-const SAME: f32 = 0.5;
+/// Truncation in gray levels of the difference between a pixel and the cells of a surface.
+const MAX_GRAY_DIFFERENCE: f32 = 32.0;
+/// Weight of the data term relative to that difference.
+const DATA_WEIGHT: f32 = 2.0;
+/// Distance in px below which two planes are the same over a cell.
+const SAME_PLANE: f32 = 0.5;
 
-/// What is known of the pair.
+/// The image pair and its winners.
 #[derive(Clone, Copy)]
 pub(crate) struct Pair<'a> {
     pub(crate) width: usize,
     pub(crate) gray: &'a [u8],
     pub(crate) winners: &'a [Winner],
     pub(crate) min_disparity: i32,
-    /// The census bits of both views in `planes` bytes per pixel, as [`crate::cost::Frame`] holds them.
+    /// The census bits of both views in `planes` bytes per pixel, as in [`crate::cost::Frame`].
     pub(crate) described: [&'a [u8]; 2],
     pub(crate) planes: usize,
     pub(crate) bits: usize,
     pub(crate) layout: Layout,
 }
 
-/// Memory of [`fill`], kept between frames.
+/// Buffers of [`fill`], reused between frames.
 #[derive(Debug, Default)]
 pub(crate) struct Filling {
     surfaces: Surfaces,
-    /// Disparity of the nearest match of each pixel of the right photograph, −∞ where there is none.
+    /// Disparity of the nearest match of each pixel of the right image, −∞ without any.
     right: Vec<f32>,
-    /// Cells without a plane of their own.
+    /// Cells without an initial surface.
     open: Vec<u32>,
     heap: BinaryHeap<Reverse<(u64, u32, u32)>>,
+    /// Of each cell.
+    extrapolations: Vec<Extrapolation>,
 }
 
-/// Bytes that [`fill`] holds on to.
+/// Returns the bytes of the buffers of [`fill`].
 pub(crate) fn bytes(width: usize, height: usize) -> usize {
     Surfaces::bytes(width, height).saturating_add(width.saturating_mul(height).saturating_mul(size_of::<f32>()))
 }
 
-/// Fills every NaN, which takes the state that its disparity explains, and smooths what was matched where the photograph is flat ([`Surfaces::smooth_flat`]). Where nothing at all was matched
-/// everything stays NaN. Of n pixels, c cells: O(n + c log c).
+/// Fills every NaN, sets the state of those pixels by their disparity, and smooths matches in low texture
+/// ([`Surfaces::smooth_low_texture`]). Without any match everything stays NaN. O(n + c log c) for n pixels in c cells.
 pub(crate) fn fill(
     level: Level,
     disparity: &mut [f32],
@@ -89,27 +96,32 @@ pub(crate) fn fill(
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
     let width = pair.width;
-    let Filling { surfaces, right, open, heap } = filling;
-    surfaces.find(level, disparity, pair.gray, width, pair.min_disparity as f32);
+    let Filling { surfaces, right, open, heap, extrapolations } = filling;
+    extrapolations.clear();
+    surfaces.segment(level, disparity, pair.gray, width, pair.min_disparity as f32);
     stage.check()?;
     if surfaces.planes.is_empty() {
         return Ok(());
     }
-    see_from_right(disparity, states, width, right);
-    surfaces.smooth_flat(disparity, width);
+    project_matches(disparity, states, width, right);
+    surfaces.smooth_low_texture(disparity, width);
     stage.check()?;
     let view = View { pair, right, disparity, states, columns: RightColumns::new(&pair) };
     open.clear();
     open.extend((0..surfaces.cells.len() as u32).filter(|&c| surfaces.labels[c as usize] == NONE));
-    spread(surfaces, view, heap, stage)?;
+    extrapolations.resize(surfaces.cells.len(), Extrapolation::default());
+    propagate_labels(surfaces, view, heap, extrapolations, stage)?;
     for pass in 0..PASSES {
         for i in 0..open.len() {
             let c = open[if pass % 2 == 0 { i } else { open.len() - 1 - i }] as usize;
-            improve(surfaces, view, c);
+            update_label(surfaces, view, c);
             if i.is_multiple_of(1024) {
                 stage.check()?;
             }
         }
+    }
+    for &c in open.iter() {
+        extrapolations[c as usize].ambiguity = surfaces.ambiguity(c as usize);
     }
     let columns = surfaces.columns;
     let filled: Vec<Vec<f32>> = (0..surfaces.cells.len().div_ceil(columns))
@@ -130,7 +142,7 @@ pub(crate) fn fill(
                         if disparity[i].is_nan() {
                             let d = filled.next().unwrap_or(f32::NAN);
                             disparity[i] = d;
-                            states[i] = cause(x, d, &right[y * width..][..width]);
+                            states[i] = unmatched_state(x, d, &right[y * width..][..width]);
                         }
                     }
                 }
@@ -140,21 +152,30 @@ pub(crate) fn fill(
     Ok(())
 }
 
-/// States of the pixels that were not matched, by the disparities they have now.
-pub(crate) fn name_causes(disparity: &[f32], states: &mut [PixelState], width: usize, filling: &mut Filling) {
-    see_from_right(disparity, states, width, &mut filling.right);
+impl Filling {
+    /// Returns the standard deviation in px of a pixel that the last [`fill`] of an image of this width filled; NaN if there was none.
+    pub(crate) fn sigma(&self, x: usize, y: usize, width: usize, state: PixelState) -> f32 {
+        let columns = width.div_ceil(CELL);
+        let cell = self.extrapolations.get(y / CELL * columns + x / CELL).filter(|_| columns == self.surfaces.columns);
+        cell.map_or(f32::NAN, |cell| cell.sigma(state))
+    }
+}
+
+/// Sets the states of unmatched pixels by their current disparities.
+pub(crate) fn classify_unmatched(disparity: &[f32], states: &mut [PixelState], width: usize, filling: &mut Filling) {
+    project_matches(disparity, states, width, &mut filling.right);
     let rows = disparity.par_chunks(width).zip(filling.right.par_chunks(width));
     states.par_chunks_mut(width).zip(rows).for_each(|(states, (disparity, right))| {
         for (x, (state, d)) in states.iter_mut().zip(disparity).enumerate() {
             if *state != PixelState::Matched {
-                *state = cause(x, *d, right);
+                *state = unmatched_state(x, *d, right);
             }
         }
     });
 }
 
-/// Why a pixel at a disparity was not matched, given what the right camera sees in its row.
-fn cause(x: usize, d: f32, right: &[f32]) -> PixelState {
+/// Returns the state of an unmatched pixel by its disparity and the matches of the right image in its row.
+fn unmatched_state(x: usize, d: f32, right: &[f32]) -> PixelState {
     let column = x as f32 - d + 0.5;
     if !(column >= 0.0 && column < right.len() as f32) {
         PixelState::OutOfView
@@ -165,29 +186,29 @@ fn cause(x: usize, d: f32, right: &[f32]) -> PixelState {
     }
 }
 
-/// The nearest confirmed match of each pixel of the right photograph.
-fn see_from_right(disparity: &[f32], states: &[PixelState], width: usize, right: &mut Vec<f32>) {
+/// Projects the matches to the right image: the nearest at each pixel.
+fn project_matches(disparity: &[f32], states: &[PixelState], width: usize, right: &mut Vec<f32>) {
     right.resize(disparity.len(), f32::NEG_INFINITY);
     let rows = disparity.par_chunks(width).zip(states.par_chunks(width));
     right.par_chunks_mut(width).zip(rows).for_each(|(right, (disparity, states))| {
         right.fill(f32::NEG_INFINITY);
         for (x, (&d, &state)) in disparity.iter().zip(states).enumerate() {
-            // Rounded: whole columns are counted from half a pixel before them. NaN compares false.
+            // Rounded to the nearest column. NaN compares false.
             let column = x as f32 - d + 0.5;
             if state == PixelState::Matched && column >= 0.0 && column < width as f32 {
-                let seen = &mut right[column as usize];
-                *seen = if d > *seen { d } else { *seen };
+                let nearest = &mut right[column as usize];
+                *nearest = if d > *nearest { d } else { *nearest };
             }
         }
     });
 }
 
-/// Where the census bits of the right photograph lie.
+/// Addresses of the census bits of the right image.
 #[derive(Clone, Copy)]
 struct RightColumns {
-    /// Bytes of the bits of a pixel.
+    /// Bytes of the census bits of a pixel.
     bytes: usize,
-    /// Elements of a row and of a phase, and the power of two that is the number of phases: see [`Layout`].
+    /// Elements of a row and of a phase, and the binary logarithm of the number of phases: see [`Layout`].
     row: usize,
     phase: usize,
     phases: u32,
@@ -206,7 +227,7 @@ impl RightColumns {
         }
     }
 
-    /// Byte of the first bits of a column within a row; `None` where it is beyond all disparities.
+    /// Returns the index of the first byte of a column within a row; `None` outside the search range.
     #[inline(always)]
     fn place(&self, column: usize, planes: usize) -> Option<usize> {
         let element = usize::try_from(self.first - column as i64).ok().filter(|&element| element < self.row)?;
@@ -214,7 +235,7 @@ impl RightColumns {
     }
 }
 
-/// The pair with what was matched.
+/// The pair with its matches.
 #[derive(Clone, Copy)]
 struct View<'a> {
     pair: Pair<'a>,
@@ -229,7 +250,7 @@ impl View<'_> {
         self.disparity.len() / self.pair.width
     }
 
-    /// The census bits of a pixel of the left photograph.
+    /// Returns the census bits of a pixel of the left image.
     #[inline(always)]
     fn bits(&self, x: usize, y: usize) -> u64 {
         let Pair { width, planes, described, .. } = self.pair;
@@ -237,52 +258,51 @@ impl View<'_> {
         (0..self.columns.bytes).fold(0, |bits, p| bits << 8 | u64::from(first[p * width]))
     }
 
-    /// What a pixel with these census bits costs at a disparity; `texture` is how much the photographs are believed, 0 to 1.
+    /// Returns the data term of a pixel with these census bits at a disparity; `texture` is the weight of the dissimilarity, 0 to 1.
     #[inline(always)]
     fn cost(&self, x: usize, y: usize, d: f32, texture: f32, bits: u64) -> f32 {
         let Pair { width, planes, described, .. } = self.pair;
         let column = x as f32 - d + 0.5;
         if !(column >= 0.0 && column < width as f32) {
-            return OUTSIDE;
+            return OUT_OF_VIEW_COST;
         }
         let column = column as usize;
-        let seen = self.right[y * width + column];
-        // −∞: nothing is known to be seen there.
-        if seen.is_finite() && d > seen + MARGIN {
-            return HIDES;
+        let visible = self.right[y * width + column];
+        // −∞: no match there.
+        if visible.is_finite() && d > visible + OCCLUSION_STEP {
+            return OCCLUDING_COST;
         }
-        if d < seen - 1.0 {
-            return HIDDEN;
+        if d < visible - 1.0 {
+            return OCCLUDED_COST;
         }
         let RightColumns { bytes, row, phase, .. } = self.columns;
-        let Some(place) = self.columns.place(column, planes) else { return OUTSIDE };
+        let Some(place) = self.columns.place(column, planes) else { return OUT_OF_VIEW_COST };
         let first = &described[1][y * planes * row + place..];
         let there = (0..bytes).fold(0, |bits, p| bits << 8 | u64::from(first[p * phase]));
-        let chance = CHANCE * self.pair.bits as f32;
+        let chance = CHANCE_BITS * self.pair.bits as f32;
         0.5 + texture * (((bits ^ there).count_ones() as f32 / chance).min(1.0) - 0.5)
     }
 
-    /// What a cell costs on a plane, by every `step`-th pixel of every `step`-th row.
+    /// Returns the data term of a plane in a cell, from every `step`-th pixel of every `step`-th row.
     fn cell_cost(&self, surfaces: &Surfaces, c: usize, plane: &Plane, step: usize) -> f32 {
         let width = self.pair.width;
-        let texture = texture(surfaces, c);
+        let texture = texture_weight(surfaces, c);
         let mut cost = 0.0;
         let (left, top) = (c % surfaces.columns * CELL, c / surfaces.columns * CELL);
         for y in (top + step / 2..(top + CELL).min(self.height())).step_by(step) {
             for x in (left + step / 2..(left + CELL).min(width)).step_by(step) {
                 let (value, i) = (plane.at(x as f64, y as f64), y * width + x);
                 let d = self.disparity[i];
-                // Of the other pixels as well.
-                let share = (step * step) as f32;
+                // Weight of the sample: the number of pixels it represents.
+                let weight = (step * step) as f32;
                 if d.is_nan() {
-                    // Weights as of every second pixel, at which they were set.
-                    cost += 0.25 * share * HIDES * self.cost(x, y, value, texture, self.bits(x, y));
+                    cost += 0.25 * weight * OCCLUDING_COST * self.cost(x, y, value, texture, self.bits(x, y));
                     if self.states[i] != PixelState::OutOfView {
-                        let failed = (self.pair.min_disparity + i32::from(self.pair.winners[i].index)) as f32;
-                        cost += share * FAILED * (failed - value).abs().min(2.0);
+                        let rejected = (self.pair.min_disparity + i32::from(self.pair.winners[i].index)) as f32;
+                        cost += weight * REJECTED_WEIGHT * (rejected - value).abs().min(2.0);
                     }
                 } else {
-                    cost += share * MATCHED * (d - value).abs().min(2.0);
+                    cost += weight * MATCH_WEIGHT * (d - value).abs().min(2.0);
                 }
             }
         }
@@ -290,28 +310,34 @@ impl View<'_> {
     }
 }
 
-/// How much the photographs are believed in a cell.
-fn texture(surfaces: &Surfaces, c: usize) -> f32 {
+/// Returns the weight of the dissimilarity in a cell, 0 to 1.
+fn texture_weight(surfaces: &Surfaces, c: usize) -> f32 {
     let steps = surfaces.cells[c].texture;
-    steps / (steps + TEXTURE)
+    steps / (steps + HALF_TEXTURE)
 }
 
-/// Gives every cell without a plane that of the cell from which the way is shortest (Dijkstra's algorithm).
-fn spread(
+/// Assigns every cell without a surface that of the cell at the shortest geodesic distance (Dijkstra's algorithm).
+fn propagate_labels(
     surfaces: &mut Surfaces,
     view: View<'_>,
     heap: &mut BinaryHeap<Reverse<(u64, u32, u32)>>,
+    extrapolations: &mut [Extrapolation],
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
     heap.clear();
     let (columns, count) = (surfaces.columns, surfaces.cells.len());
     let rows = count / columns;
-    // In thousandths of a cell, whole so that ties are broken alike everywhere.
+    let scales: Vec<[f32; 2]> = surfaces.sizes.iter().map(|&size| distance_scales(size)).collect();
+    // In 1/1024 of a cell, as integers, so that ties are broken deterministically.
     let visit = |surfaces: &Surfaces, heap: &mut BinaryHeap<_>, c: usize, so_far: u64, label: u32| {
+        let plane = &surfaces.planes[label as usize];
         for n in neighbors(c, columns, rows).into_iter().flatten().filter(|&n| surfaces.labels[n] == NONE) {
-            let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs() / EDGE;
-            let cost = view.cell_cost(surfaces, n, &surfaces.planes[label as usize], 4);
-            heap.push(Reverse((so_far + (1024.0 * (1.0 + edge + WAY * cost)) as u64, n as u32, label)));
+            let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs() / EDGE_GRAY;
+            let cost = view.cell_cost(surfaces, n, plane, 4);
+            let (x, y) = center(n, columns);
+            let is_out_of_view = x < f64::from(plane.at(x, y));
+            let step = scales[label as usize][usize::from(is_out_of_view)] * (1.0 + edge + PATH_COST_WEIGHT * cost);
+            heap.push(Reverse((so_far + (1024.0 * step) as u64, n as u32, label)));
         }
     };
     for c in 0..count {
@@ -324,6 +350,7 @@ fn spread(
         let c = c as usize;
         if surfaces.labels[c] == NONE {
             surfaces.labels[c] = label;
+            extrapolations[c].distance = cost as f32 / 1024.0;
             visit(surfaces, heap, c, cost, label);
             taken += 1;
             if taken.is_multiple_of(1024) {
@@ -334,26 +361,17 @@ fn spread(
     Ok(())
 }
 
-/// The different surfaces of a cell and the eight around it; the first `usize` hold.
-fn surfaces_around(surfaces: &Surfaces, c: usize) -> ([u32; 9], usize) {
-    let columns = surfaces.columns;
-    let (x, y) = (c % columns, c / columns);
-    let rows = surfaces.cells.len() / columns;
-    let (mut found, mut count) = ([NONE; 9], 0);
-    for ny in y.saturating_sub(1)..(y + 2).min(rows) {
-        for &label in &surfaces.labels[ny * columns..][x.saturating_sub(1)..(x + 2).min(columns)] {
-            if label != NONE && !found[..count].contains(&label) {
-                found[count] = label;
-                count += 1;
-            }
-        }
-    }
-    (found, count)
+/// Returns the scales of the geodesic distance from a surface of `size` cells, for cells in view and out of view. The distance is in units of
+/// the extent of the surface, `√size`, since a large surface determines its extrapolation more accurately and is more likely to
+/// continue; out of view its root, since there the object at the image border is mostly continued, whatever its size.
+fn distance_scales(size: usize) -> [f32; 2] {
+    let scale = (REFERENCE_SIZE / size.max(1) as f32).sqrt().clamp(DISTANCE_SCALE_RANGE.0, DISTANCE_SCALE_RANGE.1);
+    [scale, scale.sqrt()]
 }
 
-/// Gives a cell the plane of those around it that costs least, in it and at its borders.
-fn improve(surfaces: &mut Surfaces, view: View<'_>, c: usize) {
-    let (around, count) = surfaces_around(surfaces, c);
+/// Assigns a cell the surface of its neighborhood of the lowest energy: data term and smoothness term.
+fn update_label(surfaces: &mut Surfaces, view: View<'_>, c: usize) {
+    let (around, count) = surfaces.labels_around(c);
     if count < 2 {
         return;
     }
@@ -369,9 +387,9 @@ fn improve(surfaces: &mut Surfaces, view: View<'_>, c: usize) {
             let Some((n, other)) = n.and_then(|n| Some((n, surfaces.planes.get(surfaces.labels[n] as usize)?))) else {
                 continue;
             };
-            let gap = (plane.at(x, y) - other.at(x, y)).abs();
+            let distance = (plane.at(x, y) - other.at(x, y)).abs();
             let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs();
-            cost += BREAK * EDGE / (EDGE + edge) * (gap / GAP).min(1.0);
+            cost += SMOOTHNESS * EDGE_GRAY / (EDGE_GRAY + edge) * (distance / MAX_DISTANCE).min(1.0);
         }
         cost
     };
@@ -385,7 +403,7 @@ fn improve(surfaces: &mut Surfaces, view: View<'_>, c: usize) {
     surfaces.labels[c] = best.1;
 }
 
-/// The disparities of the holes of a row of cells, cell by cell.
+/// Returns the disparities of the holes of a row of cells, cell by cell.
 #[simd]
 fn fill_row<S: Simd>(_: S, surfaces: &Surfaces, view: View<'_>, row: usize) -> Vec<f32> {
     let mut values = Vec::new();
@@ -395,7 +413,8 @@ fn fill_row<S: Simd>(_: S, surfaces: &Surfaces, view: View<'_>, row: usize) -> V
     values
 }
 
-/// The disparities of a cell's holes, row by row: each pixel is of the surface of the cells around that looks like it and that it may be of.
+/// Appends the disparities of a cell's holes, in raster order: each pixel takes the surface of the neighboring cells of the lowest data term
+/// and difference in gray level.
 #[inline(always)]
 fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) {
     if surfaces.cells[c].holes == 0 {
@@ -403,17 +422,17 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
     }
     let columns = surfaces.columns;
     let (width, height) = (view.pair.width, view.height());
-    let (around, count) = surfaces_around(surfaces, c);
+    let (around, count) = surfaces.labels_around(c);
     let (xs, ys) = extent(c, columns, (width, height));
-    // Surfaces that are alike at the corners of the cell are one.
+    // Surfaces that are the same at the corners of the cell are merged.
     let corners = [(xs.start, ys.start), (xs.end - 1, ys.start), (xs.start, ys.end - 1), (xs.end - 1, ys.end - 1)];
     let (mut different, mut here, mut places) = ([0; 9], [[0f32; 4]; 9], [0; 9]);
     let mut n = 0;
     for (place, &label) in places.iter_mut().zip(&around[..count]) {
         let plane = &surfaces.planes[label as usize];
         let at = corners.map(|(x, y)| plane.at(x as f64, y as f64));
-        let alike = |other: &[f32; 4]| at.iter().zip(other).all(|(a, b)| (a - b).abs() < SAME);
-        *place = here[..n].iter().position(alike).unwrap_or(n);
+        let is_same = |other: &[f32; 4]| at.iter().zip(other).all(|(a, b)| (a - b).abs() < SAME_PLANE);
+        *place = here[..n].iter().position(is_same).unwrap_or(n);
         if *place == n {
             (different[n], here[n]) = (label as usize, at);
             n += 1;
@@ -430,10 +449,10 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
         }
         return;
     }
-    let texture = texture(surfaces, c);
+    let texture = texture_weight(surfaces, c);
     let (column, row) = (c % columns, c / columns);
     let rows = surfaces.cells.len() / columns;
-    // Gray value and place among the surfaces of the cells around.
+    // Gray level and surface of the neighboring cells.
     let mut cells = [(0f32, 0usize); 9];
     let mut known = 0;
     for ny in row.saturating_sub(1)..(row + 2).min(rows) {
@@ -451,15 +470,15 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
                 continue;
             }
             let (gray, bits) = (f32::from(view.pair.gray[y * width + x]), view.bits(x, y));
-            let mut unlike = [ALIKE; 9];
+            let mut gray_difference = [MAX_GRAY_DIFFERENCE; 9];
             for &(of_cell, place) in &cells[..known] {
-                unlike[place] = unlike[place].min((gray - of_cell).abs());
+                gray_difference[place] = gray_difference[place].min((gray - of_cell).abs());
             }
             let mut best = (f32::INFINITY, f32::NAN);
-            for (plane, unlike) in planes[..n].iter().zip(unlike) {
+            for (plane, difference) in planes[..n].iter().zip(gray_difference) {
                 let d = plane.at(x as f64, y as f64);
-                let cost = unlike / ALIKE + SEEN * view.cost(x, y, d, texture, bits);
-                // Of equals the farther one.
+                let cost = difference / MAX_GRAY_DIFFERENCE + DATA_WEIGHT * view.cost(x, y, d, texture, bits);
+                // Of equal costs the farther one.
                 if cost < best.0 || (cost == best.0 && d < best.1) {
                     best = (cost, d);
                 }
@@ -485,75 +504,78 @@ mod tests {
         40 + ((z >> 40) % 160) as u8
     }
 
-    /// A pair of a scene whose surfaces are level in disparity: what lies at a column and row of the left camera's frame (which goes on
-    /// beyond its photograph), as disparity and gray value, the nearest first.
+    /// Matches a scene of integer disparities: the surfaces at a column and row of the left camera's frame (which extends beyond its image), as
+    /// disparity and gray level, the nearest first.
     fn matched(surface: impl Fn(i64, i64) -> Vec<(i64, u8)>) -> DisparityMap {
         let left = GrayU8::from_fn(WIDTH, HEIGHT, |x, y| [surface(x as i64, y as i64)[0].1]);
         let right = GrayU8::from_fn(WIDTH, HEIGHT, |x, y| {
-            // The nearest of what projects here.
-            let seen = (0..=40).rev().find_map(|d| {
+            // The nearest surface that projects here.
+            let nearest = (0..=40).rev().find_map(|d| {
                 let there = surface(x as i64 + d, y as i64);
                 there.into_iter().find(|s| s.0 == d).map(|s| s.1)
             });
-            [seen.unwrap_or(0)]
+            [nearest.unwrap_or(0)]
         });
         let options = StereoOptions { disparities: 48, smoothing: Smoothing::None, ..Default::default() };
         StereoMatcher::new(options).unwrap().compute(left.view(), right.view(), &Silent).unwrap()
     }
 
-    fn wrong(map: &DisparityMap, pixels: impl Fn(usize, usize) -> bool, truth: impl Fn(usize, usize) -> f32) -> f64 {
+    fn bad_fraction(
+        map: &DisparityMap,
+        pixels: impl Fn(usize, usize) -> bool,
+        truth: impl Fn(usize, usize) -> f32,
+    ) -> f64 {
         let all = (0..WIDTH * HEIGHT).map(|i| (i % WIDTH, i / WIDTH)).filter(|&(x, y)| pixels(x, y));
         let (mut n, mut bad) = (0, 0);
         for (x, y) in all {
             n += 1;
             let d = map.disparity.at(x, y)[0];
             // NaN compares false.
-            let right = (d - truth(x, y)).abs() <= 2.0;
-            bad += usize::from(!right);
+            let is_good = (d - truth(x, y)).abs() <= 2.0;
+            bad += usize::from(!is_good);
         }
         bad as f64 / n as f64
     }
 
     #[test]
-    fn what_a_near_thing_hides_is_of_the_background() {
-        // A box at 30 px before a wall at 8: 22 columns on its left are hidden from the right camera.
+    fn occluded_pixels_are_filled_from_the_background() {
+        // A box at 30 px in front of a wall at 8: 22 columns on its left are occluded.
         let inside = |x: i64, y: i64| (80..120).contains(&x) && (24..72).contains(&y);
         let map = matched(|x, y| {
             let wall = (8, texture(x, y));
             if inside(x, y) { vec![(30, texture(x + 1000, y)), wall] } else { vec![wall] }
         });
-        let hidden = |x: usize, y: usize| (58..80).contains(&x) && (24..72).contains(&y);
-        // The window of 5×5 pixels reaches two pixels over the outline on three sides: 10 + 4 of 22 × 48 pixels and their corners.
-        let share = wrong(&map, hidden, |_, _| 8.0);
-        assert!(share < 0.15, "{share}");
+        let is_occluded = |x: usize, y: usize| (58..80).contains(&x) && (24..72).contains(&y);
+        // The window of 5×5 pixels extends two pixels across the boundary on three sides: 10 + 4 of 22 × 48 pixels and their corners.
+        let fraction = bad_fraction(&map, is_occluded, |_, _| 8.0);
+        assert!(fraction < 0.15, "{fraction}");
     }
 
     #[test]
-    fn what_lies_beside_the_right_photograph_is_of_the_thing_it_belongs_to() {
-        // A near thing at the left border, whose first 24 columns the right camera does not see.
+    fn out_of_view_pixels_are_filled_from_their_object() {
+        // A near object at the left border, whose first 24 columns are out of view.
         let map = matched(|x, y| vec![if x < 60 { (24, texture(x + 1000, y)) } else { (4, texture(x, y)) }]);
-        let share = wrong(&map, |x, _| x < 24, |_, _| 24.0);
-        // Nothing is at stake there: no other surface is near.
-        assert!(share < 0.02, "{share}");
+        let fraction = bad_fraction(&map, |x, _| x < 24, |_, _| 24.0);
+        // No other surface is near.
+        assert!(fraction < 0.02, "{fraction}");
         let state = map.state.at(5, 40)[0];
         assert_eq!(state, PixelState::OutOfView);
     }
 
     #[test]
     fn a_wall_without_texture_is_the_plane_of_its_frame() {
-        // A poster without texture on a wall that recedes: its inside is matched nowhere but at the rim.
+        // A textureless poster on a slanted wall: its inside is matched only at the rim.
         let inside = |x: usize, y: usize| (50..130).contains(&x) && (16..80).contains(&y);
         let steps = |y: i64| 10 + y / 6;
         let map =
             matched(|x, y| vec![(steps(y), if inside(x.max(0) as usize, y as usize) { 120 } else { texture(x, y) })]);
-        let share = wrong(&map, inside, |_, y| 10.0 + y as f32 / 6.0 - 0.4);
-        // One disparity for all of it would leave six of ten wrong; less than half of those. What is left are streaks where steps of a whole
-        // pixel in the rim are taken for level surfaces.
-        assert!(share < 0.3, "{share}");
+        let fraction = bad_fraction(&map, inside, |_, y| 10.0 + y as f32 / 6.0 - 0.4);
+        // One disparity for all of it would leave six of ten wrong; a quarter of those, for steps of whole pixels in the rim.
+        assert!(fraction < 0.15, "{fraction}");
     }
 
     #[test]
-    fn pictures_of_one_color_stay_without_disparity() {
+    fn images_of_one_color_stay_without_disparity() {
         let map = matched(|_, _| vec![(0, 90)]);
         assert!(map.disparity.as_slice().iter().all(|d| d.is_nan()));
     }

@@ -1,7 +1,7 @@
-//! The surfaces of a disparity map: planes over cells of 8×8 pixels, grown from cell to cell (as plane segmentation of range images is
-//! done: Besl & Jain, "Segmentation through variable-order surface fitting", PAMI 1988).
+//! Segmentation of a disparity map into planar surfaces by region growing over cells of 8×8 pixels (as for range images: Besl & Jain,
+//! "Segmentation through variable-order surface fitting", PAMI 1988).
 //!
-//! Each cell is known by the moments of its matched pixels, so that planes are fitted, joined and judged without looking at pixels again.
+//! A cell has the moments of its matched pixels, from which planes are fitted, merged and tested without visiting pixels again.
 
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
@@ -10,31 +10,31 @@ use std::{collections::VecDeque, ops::Range};
 
 /// Side of a cell in px.
 pub(crate) const CELL: usize = 8;
-/// No surface.
+/// The label of cells without a surface.
 pub(crate) const NONE: u32 = u32::MAX;
-/// Matched pixels that a cell needs for a plane of its own.
-const LEAST: f64 = 12.0;
-/// Disparities of a cell that spread over more px are of two surfaces, of which the larger one counts.
-const SPREAD: f32 = 3.0;
-/// Root mean squared distance in px from a surface's plane up to which a cell joins it, and what is added where the photograph is flat: there
-/// matches are less exact. Together with the other constants below and those of [`crate::surface_filling`] set on 23 public pairs with truth
-/// (Middlebury, DrivingStereo); 0.4 to 0.9 and 0.5 to 2 px differ by 0.3 points of the pixels that are wrong by more than 2 px, but on
-/// roads, where 0.4 leaves 12 % and 0.9 leaves 9 %.
-const FITS: f64 = 0.9;
-const FITS_FLAT: f64 = 2.0;
-/// Gray levels a horizontal step (mean of a cell) from which a cell is no longer flat, and below which it is wholly flat.
-const FLAT: (f32, f32) = (3.0, 1.0);
-/// Held against slopes in px² (as so many squared distances of pixels): 8×8 pixels have 336 of their own.
+/// Minimum number of matched pixels of a cell of a surface.
+const MIN_PIXELS: f64 = 12.0;
+/// Range of the disparities of a cell in px above which they are of two surfaces, of which the larger one is used.
+const MAX_CELL_RANGE: f32 = 3.0;
+/// RMS distance in px from the plane of a surface up to which a cell joins it, and its increase in low texture, where matches are less
+/// accurate. Set on 23 public pairs with ground truth (Middlebury, DrivingStereo), as the constants below and those of
+/// [`crate::surface_filling`]; 0.4 to 0.9 and 0.5 to 2 px differ by 0.3 points of the errors above 2 px, except on roads, where 0.4 leaves
+/// 12 % and 0.9 leaves 9 %.
+const MAX_PLANE_RMS: f64 = 0.9;
+const MAX_PLANE_RMS_LOW_TEXTURE: f64 = 2.0;
+/// Mean absolute difference of horizontal neighbors in gray levels from which a cell is textured, and below which it is textureless.
+const TEXTURE_RANGE: (f32, f32) = (3.0, 1.0);
+/// Ridge regularization of the slopes in px², added to the second central moments; those of 8×8 pixels are 336.
 const RIDGE: f64 = 300.0;
-/// Steepest slopes, in px of disparity per px across and down. (Across, 1 would be a surface seen edge-on by one camera.)
-const STEEPEST: (f64, f64) = (0.8, 2.0);
-/// Surfaces of so many cells smooth the flat ones among them, each by those up to so many cells away.
-const LARGE: usize = 12;
-const WINDOW: usize = 2;
-/// Pixels farther from the plane than this are not smoothed.
-const SMOOTHED: f32 = 3.0;
+/// Maximum horizontal and vertical slope, in px of disparity per px. (A horizontal slope of 1 is a surface seen edge-on by one camera.)
+const MAX_SLOPE: (f64, f64) = (0.8, 2.0);
+/// Low-texture cells of surfaces of at least this many cells are smoothed, by the plane of those within a window of this radius in cells.
+const MIN_SMOOTHED_CELLS: usize = 12;
+const SMOOTHING_RADIUS: usize = 2;
+/// Distance from the plane in px from which on pixels are not smoothed.
+const MAX_SMOOTHED_DISTANCE: f32 = 3.0;
 
-/// Sums over pixels, relative to a point.
+/// Moments of pixels with disparities, relative to a point.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Moments {
     pub(crate) n: f64,
@@ -57,7 +57,7 @@ impl Moments {
         self.join(&one);
     }
 
-    /// Relative to a point that lies `(-dx, -dy)` from the one before.
+    /// Returns the moments relative to a point at `(-dx, -dy)` from the current one.
     fn shifted(&self, dx: f64, dy: f64) -> Self {
         Self {
             n: self.n,
@@ -73,7 +73,7 @@ impl Moments {
         }
     }
 
-    /// Adds sums relative to the same point.
+    /// Adds moments relative to the same point.
     fn join(&mut self, other: &Self) {
         self.n += other.n;
         self.x += other.x;
@@ -87,7 +87,7 @@ impl Moments {
         self.dd += other.dd;
     }
 
-    /// The plane `a x + b y + c` of least squares, with [`RIDGE`]. There is a pixel at least.
+    /// Fits the plane `a x + b y + c` by least squares with [`RIDGE`]. There is at least one pixel.
     pub(crate) fn fit(&self) -> [f64; 3] {
         let (mx, my, md) = (self.x / self.n, self.y / self.n, self.d / self.n);
         let xx = self.xx - self.n * mx * mx + RIDGE;
@@ -96,13 +96,13 @@ impl Moments {
         let xd = self.xd - self.n * mx * md;
         let yd = self.yd - self.n * my * md;
         let det = xx * yy - xy * xy;
-        let a = ((xd * yy - yd * xy) / det).clamp(-STEEPEST.0, STEEPEST.0);
-        let b = ((yd * xx - xd * xy) / det).clamp(-STEEPEST.1, STEEPEST.1);
+        let a = ((xd * yy - yd * xy) / det).clamp(-MAX_SLOPE.0, MAX_SLOPE.0);
+        let b = ((yd * xx - xd * xy) / det).clamp(-MAX_SLOPE.1, MAX_SLOPE.1);
         [a, b, md - a * mx - b * my]
     }
 
-    /// Root mean squared distance from a plane.
-    fn distance(&self, [a, b, c]: [f64; 3]) -> f64 {
+    /// Returns the RMS distance from a plane.
+    fn rms_distance(&self, [a, b, c]: [f64; 3]) -> f64 {
         let squares = self.dd - 2.0 * (a * self.xd + b * self.yd + c * self.d)
             + a * a * self.xx
             + 2.0 * a * b * self.xy
@@ -113,22 +113,22 @@ impl Moments {
     }
 }
 
-/// What is known of a cell.
+/// Statistics of a cell.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Cell {
-    /// Of the matched pixels of its larger surface, relative to its center.
+    /// Moments of the matched pixels of its larger surface, relative to its center.
     moments: Moments,
-    /// Range of their disparities.
+    /// Minimum and maximum of their disparities.
     range: (f32, f32),
-    /// Mean gray value.
+    /// Mean gray level.
     pub(crate) gray: f32,
-    /// Mean difference between horizontal neighbors, in gray levels.
+    /// Mean absolute difference of horizontal neighbors, in gray levels.
     pub(crate) texture: f32,
-    /// Pixels without a disparity.
+    /// Number of pixels without a disparity.
     pub(crate) holes: u32,
 }
 
-/// A plane within the range of disparities it is known for.
+/// A plane, clamped to a range of disparities.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Plane {
     origin: (f64, f64),
@@ -137,7 +137,7 @@ pub(crate) struct Plane {
 }
 
 impl Plane {
-    /// Disparity at a pixel.
+    /// Returns the disparity at a pixel.
     #[inline(always)]
     pub(crate) fn at(&self, x: f64, y: f64) -> f32 {
         let [a, b, c] = self.coefficients;
@@ -145,62 +145,62 @@ impl Plane {
     }
 }
 
-/// Cells and surfaces of a map, kept between frames.
+/// Cells and surfaces of a map, reused between frames.
 #[derive(Debug, Default)]
 pub(crate) struct Surfaces {
     pub(crate) columns: usize,
     pub(crate) cells: Vec<Cell>,
-    /// The surface of each cell, [`NONE`] for those without a plane.
+    /// The surface of each cell, or [`NONE`].
     pub(crate) labels: Vec<u32>,
     pub(crate) planes: Vec<Plane>,
-    /// Cells of each surface.
-    sizes: Vec<usize>,
+    /// Number of cells of each surface.
+    pub(crate) sizes: Vec<usize>,
     order: Vec<(u64, u32)>,
     queue: VecDeque<usize>,
 }
 
-/// Center of a cell in px.
+/// Returns the center of a cell in px.
 pub(crate) fn center(cell: usize, columns: usize) -> (f64, f64) {
     let middle = |i: usize| (i * CELL) as f64 + 0.5 * (CELL - 1) as f64;
     (middle(cell % columns), middle(cell / columns))
 }
 
-/// Columns and rows of a cell.
+/// Returns the columns and rows of a cell.
 pub(crate) fn extent(cell: usize, columns: usize, (width, height): (usize, usize)) -> (Range<usize>, Range<usize>) {
     let (left, top) = (cell % columns * CELL, cell / columns * CELL);
     (left..(left + CELL).min(width), top..(top + CELL).min(height))
 }
 
 impl Surfaces {
-    /// Bytes for images of this size.
+    /// Returns the bytes for images of this size.
     pub(crate) fn bytes(width: usize, height: usize) -> usize {
         let cell = size_of::<Cell>() + 2 * size_of::<u32>() + size_of::<Plane>() + size_of::<usize>() + 16;
         width.div_ceil(CELL).saturating_mul(height.div_ceil(CELL)).saturating_mul(cell)
     }
 
-    /// Finds the surfaces of a map (NaN where unknown). Linear in the number of pixels; sorting the cells is not, and takes no time.
-    pub(crate) fn find(&mut self, level: Level, disparity: &[f32], gray: &[u8], width: usize, lowest: f32) {
+    /// Segments a map (NaN where unknown) into surfaces. Linear in the number of pixels, except for sorting the cells.
+    pub(crate) fn segment(&mut self, level: Level, disparity: &[f32], gray: &[u8], width: usize, lowest: f32) {
         let height = disparity.len() / width;
         self.columns = width.div_ceil(CELL);
         self.cells.resize(self.columns * height.div_ceil(CELL), Cell::default());
         let columns = self.columns;
         self.cells.par_chunks_mut(columns).enumerate().for_each(|(row, cells)| {
-            dispatch!(level, simd => find_cells(simd, disparity, gray, (width, height), row, cells));
+            dispatch!(level, simd => compute_cells(simd, disparity, gray, (width, height), row, cells));
         });
-        self.grow(LEAST, lowest);
+        self.grow(MIN_PIXELS, lowest);
         if self.planes.is_empty() {
-            // Thin things only.
+            // Thin structures only.
             self.grow(1.0, lowest);
         }
     }
 
-    /// How flat the photograph is in a cell, 0 to 1.
-    fn flatness(&self, cell: usize) -> f64 {
-        f64::from(((FLAT.0 - self.cells[cell].texture) / (FLAT.0 - FLAT.1)).clamp(0.0, 1.0))
+    /// Returns how textureless a cell is, 0 to 1.
+    fn texturelessness(&self, cell: usize) -> f64 {
+        f64::from(((TEXTURE_RANGE.0 - self.cells[cell].texture) / (TEXTURE_RANGE.0 - TEXTURE_RANGE.1)).clamp(0.0, 1.0))
     }
 
-    /// Grows surfaces from cells with `least` matched pixels, the most even ones first.
-    fn grow(&mut self, least: f64, lowest: f32) {
+    /// Grows surfaces from cells of at least `min_pixels` matched pixels, the most planar ones first.
+    fn grow(&mut self, min_pixels: f64, lowest: f32) {
         let columns = self.columns;
         let rows = self.cells.len() / columns;
         self.labels.clear();
@@ -208,9 +208,9 @@ impl Surfaces {
         self.planes.clear();
         self.sizes.clear();
         self.order.clear();
-        for (c, cell) in self.cells.iter().enumerate().filter(|(_, cell)| cell.moments.n >= least) {
-            // In eighths of a pixel; among equals the fullest.
-            let distance = cell.moments.distance(cell.moments.fit());
+        for (c, cell) in self.cells.iter().enumerate().filter(|(_, cell)| cell.moments.n >= min_pixels) {
+            // In eighths of a pixel; of equals the one with the most pixels.
+            let distance = cell.moments.rms_distance(cell.moments.fit());
             let full = (CELL * CELL) as u64 - cell.moments.n as u64;
             self.order.push(((8.0 * distance) as u64 * 1024 + full, c as u32));
         }
@@ -225,8 +225,9 @@ impl Surfaces {
                 let (x, y) = center(c, columns);
                 cells[c].moments.shifted(x - origin.0, y - origin.1)
             };
-            let open = |surfaces: &Self, c: usize| surfaces.labels[c] == NONE && surfaces.cells[c].moments.n >= least;
-            // The slope of a single cell is coarse: that of the nine around where they are one plane.
+            let open =
+                |surfaces: &Self, c: usize| surfaces.labels[c] == NONE && surfaces.cells[c].moments.n >= min_pixels;
+            // The slope of a single cell is inaccurate: that of the 3×3 cells, if they are one plane.
             let mut all = self.cells[seed].moments;
             let mut around = all;
             let (sx, sy) = (seed % columns, seed / columns);
@@ -238,7 +239,7 @@ impl Surfaces {
                 }
             }
             let mut plane = around.fit();
-            if around.distance(plane) >= FITS {
+            if around.rms_distance(plane) >= MAX_PLANE_RMS {
                 plane = all.fit();
             }
             let label = self.planes.len() as u32;
@@ -253,7 +254,8 @@ impl Surfaces {
                         continue;
                     }
                     let moments = moved(&self.cells, n);
-                    if moments.distance(plane) > FITS + FITS_FLAT * self.flatness(n) {
+                    if moments.rms_distance(plane) > MAX_PLANE_RMS + MAX_PLANE_RMS_LOW_TEXTURE * self.texturelessness(n)
+                    {
                         continue;
                     }
                     self.labels[n] = label;
@@ -267,7 +269,7 @@ impl Surfaces {
                     }
                 }
             }
-            // No farther than it reaches itself: beyond, a plane is a guess.
+            // Extrapolated by no more than its own range of disparities.
             let reach = range.1 - range.0 + 1.0;
             let range = (f64::from((range.0 - reach).max(lowest)), f64::from(range.1 + reach));
             self.planes.push(Plane { origin, coefficients: all.fit(), range: (range.0.min(range.1), range.1) });
@@ -275,9 +277,35 @@ impl Surfaces {
         }
     }
 
-    /// Draws the disparities of flat cells to the plane of the cells around that are of the same surface, where that is large: matches in
-    /// flat surroundings are right within a pixel or two, and those of many cells together within a fraction of one.
-    pub(crate) fn smooth_flat(&self, disparity: &mut [f32], width: usize) {
+    /// Returns the distinct labels of a cell and its 8-neighbors, and their number.
+    pub(crate) fn labels_around(&self, c: usize) -> ([u32; 9], usize) {
+        let columns = self.columns;
+        let (x, y) = (c % columns, c / columns);
+        let rows = self.cells.len() / columns;
+        let (mut found, mut count) = ([NONE; 9], 0);
+        for ny in y.saturating_sub(1)..(y + 2).min(rows) {
+            for &label in &self.labels[ny * columns..][x.saturating_sub(1)..(x + 2).min(columns)] {
+                if label != NONE && !found[..count].contains(&label) {
+                    found[count] = label;
+                    count += 1;
+                }
+            }
+        }
+        (found, count)
+    }
+
+    /// Returns the largest difference in px between the surface of a cell and those of its 8-neighbors.
+    pub(crate) fn ambiguity(&self, c: usize) -> f32 {
+        let (around, count) = self.labels_around(c);
+        let (x, y) = center(c, self.columns);
+        let at = |label: u32| self.planes[label as usize].at(x, y);
+        let own = at(self.labels[c]);
+        around[..count].iter().map(|&label| (at(label) - own).abs()).fold(0.0, f32::max)
+    }
+
+    /// Moves the disparities of low-texture cells of large surfaces to the plane of the surrounding cells of the surface: matches in low
+    /// texture are accurate to a pixel or two, the plane of many cells to a fraction of one.
+    pub(crate) fn smooth_low_texture(&self, disparity: &mut [f32], width: usize) {
         let columns = self.columns;
         let rows = self.cells.len() / columns;
         disparity.par_chunks_mut(CELL * width).enumerate().for_each(|(row, disparity)| {
@@ -285,13 +313,13 @@ impl Surfaces {
             for x in 0..columns {
                 let c = row * columns + x;
                 let label = self.labels[c];
-                let flatness = self.flatness(c) as f32;
-                if label == NONE || flatness == 0.0 || self.sizes[label as usize] < LARGE {
+                let texturelessness = self.texturelessness(c) as f32;
+                if label == NONE || texturelessness == 0.0 || self.sizes[label as usize] < MIN_SMOOTHED_CELLS {
                     continue;
                 }
                 let mut around = Moments::default();
-                for ny in row.saturating_sub(WINDOW)..(row + WINDOW + 1).min(rows) {
-                    for nx in x.saturating_sub(WINDOW)..(x + WINDOW + 1).min(columns) {
+                for ny in row.saturating_sub(SMOOTHING_RADIUS)..(row + SMOOTHING_RADIUS + 1).min(rows) {
+                    for nx in x.saturating_sub(SMOOTHING_RADIUS)..(x + SMOOTHING_RADIUS + 1).min(columns) {
                         let n = ny * columns + nx;
                         if self.labels[n] == label {
                             let away = |a: usize, b: usize| (a as f64 - b as f64) * CELL as f64;
@@ -307,7 +335,7 @@ impl Surfaces {
                     for (x, d) in xs.clone().zip(&mut disparity[y * width..][xs.clone()]) {
                         let off = (a * (x as f64 - middle_x) + first) as f32 - *d;
                         // NaN compares false.
-                        *d += if off.abs() < SMOOTHED { flatness * off } else { 0.0 };
+                        *d += if off.abs() < MAX_SMOOTHED_DISTANCE { texturelessness * off } else { 0.0 };
                     }
                 }
             }
@@ -315,7 +343,7 @@ impl Surfaces {
     }
 }
 
-/// The cells beside, above and below one.
+/// Returns the 4-neighbors of a cell.
 pub(crate) fn neighbors(c: usize, columns: usize, rows: usize) -> [Option<usize>; 4] {
     let (x, y) = (c % columns, c / columns);
     [
@@ -326,9 +354,9 @@ pub(crate) fn neighbors(c: usize, columns: usize, rows: usize) -> [Option<usize>
     ]
 }
 
-/// The cells of a row.
+/// Computes the statistics of a row of cells.
 #[simd]
-fn find_cells<S: Simd>(_: S, disparity: &[f32], gray: &[u8], size: (usize, usize), row: usize, cells: &mut [Cell]) {
+fn compute_cells<S: Simd>(_: S, disparity: &[f32], gray: &[u8], size: (usize, usize), row: usize, cells: &mut [Cell]) {
     for (column, cell) in cells.iter_mut().enumerate() {
         *cell = Cell::new(disparity, gray, size, (column, row));
     }
@@ -353,9 +381,9 @@ impl Cell {
             let next = gray[left + 1..].iter().chain(gray.last());
             steps += gray[left..right].iter().zip(next).map(|(&a, &b)| u32::from(a.abs_diff(b))).sum::<u32>();
         }
-        // Halved twice: three surfaces in a cell.
+        // Split twice: a cell may have three surfaces.
         for _ in 0..2 {
-            if high - low > SPREAD {
+            if high - low > MAX_CELL_RANGE {
                 let middle = 0.5 * (low + high);
                 let (mut above, mut least, mut below, mut most) = (0, high, 0, low);
                 for y in top..bottom {
@@ -372,7 +400,7 @@ impl Cell {
         }
         let mut moments = Moments::default();
         for y in top..bottom {
-            // A row in single precision, relative to the lowest: exact to 1e-5 px.
+            // Rows in single precision, relative to the lowest disparity: accurate to 1e-5 px.
             let [mut n, mut x1, mut x2, mut d1, mut xd, mut d2] = [0f32; 6];
             for (x, &d) in disparity[y * width..][left..right].iter().enumerate() {
                 let (x, off) = (x as f32 - 0.5 * (CELL - 1) as f32, d - low);
@@ -413,53 +441,53 @@ mod tests {
     const WIDTH: usize = 84;
     const HEIGHT: usize = 60;
 
-    fn found(d: impl Fn(usize, usize) -> f32, gray: u8) -> (Surfaces, Vec<f32>) {
+    fn segmented(d: impl Fn(usize, usize) -> f32, gray: u8) -> (Surfaces, Vec<f32>) {
         let disparity: Vec<f32> = (0..WIDTH * HEIGHT).map(|i| d(i % WIDTH, i / WIDTH)).collect();
         let mut surfaces = Surfaces::default();
-        surfaces.find(Level::new(), &disparity, &vec![gray; WIDTH * HEIGHT], WIDTH, 0.0);
+        surfaces.segment(Level::new(), &disparity, &vec![gray; WIDTH * HEIGHT], WIDTH, 0.0);
         (surfaces, disparity)
     }
 
     #[test]
-    fn two_planes_are_two_surfaces_each_where_it_is() {
-        // A road that rises by 0.4 px a row, and from column 40 on (a border of cells) a wall before it.
+    fn two_planes_are_two_surfaces() {
+        // A road that rises by 0.4 px a row, and from column 40 on (a cell border) a wall in front of it.
         let road = |x: usize, y: usize| 5.0 + 0.4 * y as f32 - 0.05 * x as f32;
-        let (surfaces, _) = found(|x, y| if x < 40 { road(x, y) } else { 45.0 + 0.1 * x as f32 }, 90);
+        let (surfaces, _) = segmented(|x, y| if x < 40 { road(x, y) } else { 45.0 + 0.1 * x as f32 }, 90);
         assert_eq!(surfaces.planes.len(), 2);
         for (c, &label) in surfaces.labels.iter().enumerate() {
             let (x, y) = center(c, surfaces.columns);
             let value = f64::from(surfaces.planes[label as usize].at(x, y));
             let truth = if x < 40.0 { 5.0 + 0.4 * y - 0.05 * x } else { 45.0 + 0.1 * x };
-            // The ridge takes a hundredth of the slope of thousands of pixels.
+            // The ridge reduces the slope of thousands of pixels by a hundredth.
             assert!((value - truth).abs() < 0.1, "{x} {y}: {value} for {truth}");
         }
     }
 
     #[test]
-    fn an_empty_map_has_no_surfaces_and_a_thin_thing_one() {
-        assert!(found(|_, _| f32::NAN, 90).0.planes.is_empty());
-        let (surfaces, _) = found(|x, _| if x == 20 { 7.0 } else { f32::NAN }, 90);
+    fn an_empty_map_has_no_surfaces_and_a_thin_structure_one() {
+        assert!(segmented(|_, _| f32::NAN, 90).0.planes.is_empty());
+        let (surfaces, _) = segmented(|x, _| if x == 20 { 7.0 } else { f32::NAN }, 90);
         assert_eq!(surfaces.planes.len(), 1);
         assert!((surfaces.planes[0].at(20.0, 30.0) - 7.0).abs() < 1e-3);
     }
 
     #[test]
-    fn steps_of_a_flat_road_become_a_slope() {
-        // Whole pixels, as matches without texture are: off by half a pixel, 0.29 in the mean of squares.
+    fn steps_of_a_textureless_road_become_a_slope() {
+        // Whole pixels, as matches in low texture: errors of up to half a pixel, RMS 0.29.
         let road = |y: usize| 5.0 + 0.15 * y as f32;
-        let (surfaces, mut disparity) = found(|_, y| road(y).round(), 90);
-        surfaces.smooth_flat(&mut disparity, WIDTH);
+        let (surfaces, mut disparity) = segmented(|_, y| road(y).round(), 90);
+        surfaces.smooth_low_texture(&mut disparity, WIDTH);
         let squares: f32 = disparity.iter().enumerate().map(|(i, d)| (d - road(i / WIDTH)).powi(2)).sum();
         let off = (squares / disparity.len() as f32).sqrt();
-        // Planes over forty rows, which hold six steps, leave a third of it.
+        // Planes over forty rows, which have six steps, leave a third of it.
         assert!(off < 0.1, "{off}");
-        // With texture, matches are believed.
+        // In texture, matches are kept.
         let textured: Vec<u8> = (0..WIDTH * HEIGHT).map(|i| (i % 2 * 40) as u8).collect();
         let mut surfaces = Surfaces::default();
         let steps: Vec<f32> = (0..WIDTH * HEIGHT).map(|i| road(i / WIDTH).round()).collect();
-        surfaces.find(Level::new(), &steps, &textured, WIDTH, 0.0);
+        surfaces.segment(Level::new(), &steps, &textured, WIDTH, 0.0);
         let mut kept = steps.clone();
-        surfaces.smooth_flat(&mut kept, WIDTH);
+        surfaces.smooth_low_texture(&mut kept, WIDTH);
         assert_eq!(kept, steps);
     }
 }

@@ -1,4 +1,4 @@
-//! A matcher of another crate, in the place of ours. Nothing of `cv-stereo` knows it.
+//! A matcher implemented outside of `cv-stereo`, through its trait.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -51,7 +51,7 @@ impl DisparityMatcher<u8, 1> for BlockMatcher {
     }
 }
 
-/// A wall of noise, seen `shift` pixels further left.
+/// A wall of noise, shifted by `shift` pixels to the left.
 fn wall(shift: usize) -> GrayU8 {
     GrayU8::from_fn(80, 40, |x, y| {
         let mut v = ((x + shift) as u32).wrapping_mul(0x9E37_79B9) ^ (y as u32).wrapping_mul(0x85EB_CA6B);

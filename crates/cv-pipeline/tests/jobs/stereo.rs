@@ -89,25 +89,29 @@ fn depth_is_within_five_percent_and_exposure_does_not_matter() {
 
 #[test]
 fn errors_agree_with_the_stated_uncertainty() {
-    // Errors within one and within two standard deviations, for those stated below and above 0.15 px, which halves
-    // them.
-    let mut counts = [[0u32; 3]; 2];
+    // Errors within one and within two standard deviations: of matched pixels below and above 0.15 px, which halves
+    // them, and of filled ones.
+    let mut counts = [[0u32; 3]; 3];
     for RenderedScene { name, pair, darker: other, .. } in &*SCENES {
         let mut matcher = StereoMatcher::new(StereoOptions { disparities: 96, ..StereoOptions::default() }).unwrap();
         let map = matcher.compute(pair.left.image.view(), other.right.image.view(), &Silent).unwrap();
         let sigma = matcher.uncertainty(&map);
         for (y, x) in (0..480).flat_map(|y| (0..640).map(move |x| (y, x))).filter(|&(y, x)| pair.visible.at(x, y)[0]) {
             let (sigma, error) = (sigma.at(x, y)[0], (map.disparity.at(x, y)[0] - pair.disparity.at(x, y)[0]).abs());
-            assert_eq!(sigma.is_finite(), map.state.at(x, y)[0] == PixelState::Matched, "{name}: {x} {y}");
-            if sigma.is_finite() {
-                let counts = &mut counts[usize::from(sigma > 0.15)];
-                counts[0] += 1;
-                counts[1] += u32::from(error <= sigma);
-                counts[2] += u32::from(error <= 2.0 * sigma);
-            }
+            assert!(sigma.is_finite(), "{name}: {x} {y}");
+            let is_matched = map.state.at(x, y)[0] == PixelState::Matched;
+            let counts = &mut counts[if is_matched { usize::from(sigma > 0.15) } else { 2 }];
+            counts[0] += 1;
+            counts[1] += u32::from(error <= sigma);
+            counts[2] += u32::from(error <= 2.0 * sigma);
         }
     }
-    for [all, one, two] in counts {
+    let [below, above, filled] = counts;
+    let [all, one, two] = filled.map(f64::from);
+    println!("{all} filled pixels: {:.3} within one standard deviation, {:.3} within two", one / all, two / all);
+    // Fitted to photographs of harder scenes: where rendered ones have few wrong surfaces, it is too large rather than too small.
+    assert!(all > 10_000.0 && (0.6..0.95).contains(&(one / all)) && two / all > 0.8, "{filled:?}");
+    for [all, one, two] in [below, above] {
         let [one, two] = [one, two].map(|n| f64::from(n) / f64::from(all));
         println!("{all} pixels: {one:.3} within one standard deviation, {two:.3} within two");
         // 0.68 and 0.95 are those of a normal distribution; errors have heavier tails, and scenes differ.

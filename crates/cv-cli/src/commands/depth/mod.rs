@@ -149,7 +149,7 @@ pub(crate) struct Args {
     /// Where to write the mask of matched pixels, as a PNG: 255 matched, 0 filled or invalid.
     #[arg(long, value_name = "PNG")]
     matched: Option<PathBuf>,
-    /// Where to write the standard deviation of the depth, or of the disparity if the geometry is unknown; invalid where filled:
+    /// Where to write the standard deviation of the depth, or of the disparity without a geometry; of filled pixels by how far their surface was extrapolated:
     /// .pfm, .npy or .png (as --depth or the disparity).
     #[arg(long, value_name = "FILE")]
     uncertainty: Option<PathBuf>,

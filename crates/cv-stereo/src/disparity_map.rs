@@ -1,0 +1,55 @@
+//! Disparity maps and the state of their pixels.
+
+use cv_core::{GrayF32, Image, Sample};
+
+/// How a pixel came by its disparity.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[repr(u8)]
+pub enum PixelState {
+    /// Matched, and accepted by every check.
+    #[default]
+    Matched,
+    /// Occluded: visible in the left image only, behind something nearer in the right one. Filled from the background.
+    Occluded,
+    /// The match failed a check, or smoothing moved a depth discontinuity across the pixel. Filled from the surrounding surfaces.
+    Mismatched,
+    /// Out of view: the correspondence would be outside the right image. Filled from the surrounding surfaces.
+    OutOfView,
+}
+
+impl Sample for PixelState {}
+
+/// Disparities of a left image.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DisparityMap {
+    /// `x_left − x_right` in px, NaN where unknown.
+    pub disparity: GrayF32,
+    /// Where each disparity comes from; all but [`PixelState::Matched`] are filled, or NaN without filling.
+    pub state: Image<PixelState, 1>,
+}
+
+impl DisparityMap {
+    /// An empty map, to be passed to [`crate::StereoMatcher::compute_into`].
+    pub fn empty() -> Self {
+        Self { disparity: GrayF32::new(0, 0, [0.0]), state: Image::new(0, 0, [PixelState::Matched]) }
+    }
+
+    pub(crate) fn resize(&mut self, width: usize, height: usize) {
+        if self.disparity.size() != (width, height) {
+            self.disparity = GrayF32::new(width, height, [f32::NAN]);
+            self.state = Image::new(width, height, [PixelState::Matched]);
+        }
+    }
+
+    /// Fraction of pixels with a disparity, filled ones included.
+    pub fn valid_fraction(&self) -> f64 {
+        let d = self.disparity.as_slice();
+        d.iter().filter(|v| v.is_finite()).count() as f64 / d.len().max(1) as f64
+    }
+
+    /// Fraction of pixels that were matched and accepted by every check.
+    pub fn matched_fraction(&self) -> f64 {
+        let s = self.state.as_slice();
+        s.iter().filter(|&&v| v == PixelState::Matched).count() as f64 / s.len().max(1) as f64
+    }
+}

@@ -1,0 +1,107 @@
+//! Memory of a matcher: how many bytes an image size takes, and in how many rows at a time costs are aggregated under a limit.
+
+use crate::census::planes;
+use crate::coarse_prior::Prior;
+use crate::sgm::Aggregator;
+use crate::winner::Winner;
+use crate::{DisparityMap, StereoError, StereoMatcher, edge_preserving, local_expansion, surface_filling};
+use cv_core::Progress;
+
+/// Rows by which strips overlap: aggregation paths that start farther away hardly change the sums.
+pub(crate) const STRIP_OVERLAP: usize = 32;
+
+/// Fewest rows of a strip: lower ones would mostly repeat the overlap.
+const MIN_STRIP_ROWS: usize = 32;
+
+impl StereoMatcher {
+    /// Returns the bytes that matching images of this size takes, outputs included: about one byte per pixel and disparity for the
+    /// sums, and seventy per pixel, in quality mode a hundred more (gray levels 6, census bits 3 to 8 of each view, winners 12, labels
+    /// up to 8, priors 4, surfaces 7, the planes of the smoothing 16, outputs and scratch 9), and for the pyramid levels an eighth of the
+    /// sums and a third of the rest. Under [`StereoOptions::max_memory`](crate::StereoOptions::max_memory) the sums are those of a strip.
+    pub fn memory(&self, width: usize, height: usize) -> usize {
+        let coarse = self.coarse_memory(width, height);
+        let rows = self.strip_rows(width, height, coarse).unwrap_or(height);
+        self.memory_of(width, height, rows, coarse)
+    }
+
+    /// Returns the bytes of the coarser pyramid levels.
+    pub(crate) fn coarse_memory(&self, width: usize, height: usize) -> usize {
+        self.coarser(width, height).map_or(0, |(_, bytes)| bytes)
+    }
+
+    /// Returns the bytes where `rows` rows at a time are aggregated and the coarser levels take `coarse`.
+    fn memory_of(&self, width: usize, height: usize, rows: usize, coarse: usize) -> usize {
+        let options = self.options();
+        let pixels = width.saturating_mul(height);
+        let planes = planes(options.census, options.intensity_cost);
+        let strip = if rows < height { (rows + 2 * STRIP_OVERLAP).min(height) } else { 0 };
+        let whole = if rows < height { 0 } else { height };
+        // Gray of both views in 16 bits, of one in 8; winners of both views; labels, scratch and outputs.
+        let fixed = 5 + planes + size_of::<Winner>() + size_of::<u16>() + 8 + 4 + 5 + size_of::<Prior>();
+        let stride = self.layout().right_row(width);
+        Aggregator::bytes(width, strip.max(whole), self.layout())
+            .saturating_add(strip.saturating_mul(width).saturating_mul(size_of::<Winner>() + size_of::<u16>()))
+            .saturating_add(pixels.saturating_mul(fixed))
+            .saturating_add(edge_preserving::bytes(options.smoothing, width, height))
+            .saturating_add(if options.fill || options.quality { surface_filling::bytes(width, height) } else { 0 })
+            .saturating_add(if options.quality { local_expansion::bytes(width, height) } else { 0 })
+            .saturating_add(coarse)
+            .saturating_add(stride.saturating_mul(height).saturating_mul(planes))
+    }
+
+    /// Returns how many rows at a time are aggregated under the memory limit; `None` for all, and where even the lowest strips
+    /// exceed it.
+    pub(crate) fn strip_rows(&self, width: usize, height: usize, coarse: usize) -> Option<usize> {
+        let allowed = self.options().max_memory?;
+        if self.memory_of(width, height, height, coarse) <= allowed {
+            return None;
+        }
+        // The more rows, the fewer are computed twice.
+        let fits = |rows: &usize| self.memory_of(width, height, *rows, coarse) <= allowed;
+        (MIN_STRIP_ROWS..height).step_by(MIN_STRIP_ROWS).take_while(fits).last()
+    }
+
+    /// Refuses image sizes that are not possible with these options.
+    pub(crate) fn check_size(&self, width: usize, height: usize) -> Result<(), StereoError> {
+        self.check_memory(width, height, self.memory(width, height))
+    }
+
+    /// As `check_size`, where these images take `bytes`.
+    pub(crate) fn check_memory(&self, width: usize, height: usize, bytes: usize) -> Result<(), StereoError> {
+        let options = self.options();
+        let (window_width, window_height) = options.census.size();
+        if width < window_width || height < window_height {
+            return Err(StereoError::TooSmall { width, height, window_width, window_height });
+        }
+        let min = i64::from(options.min_disparity);
+        let max = min + options.disparities as i64 - 1;
+        if min >= width as i64 || max <= -(width as i64) {
+            return Err(StereoError::RangeOutsideImage { min, max, width });
+        }
+        let allowed = options.max_memory.unwrap_or(isize::MAX as usize);
+        if bytes > allowed {
+            let coarse = self.coarse_memory(width, height);
+            let of = |rows| self.memory_of(width, height, rows, coarse);
+            let needed = of(MIN_STRIP_ROWS).min(of(height));
+            return Err(StereoError::Memory { needed, allowed });
+        }
+        Ok(())
+    }
+
+    /// Allocates the memory that images of this size need, so that the first frame takes no longer than the next.
+    ///
+    /// # Errors
+    /// [`StereoError`] where the disparities do not fit the images, or the memory is more than allowed.
+    pub fn prepare(
+        &mut self,
+        width: usize,
+        height: usize,
+        map: &mut DisparityMap,
+        progress: &dyn Progress,
+    ) -> Result<(), StereoError> {
+        self.check_size(width, height)?;
+        self.prepare_aggregation(width, height, progress)?;
+        map.resize(width, height);
+        Ok(())
+    }
+}
