@@ -318,7 +318,7 @@ fn registrations_of_other_photographs_and_damaged_ones_are_refused() {
         std::fs::write(folder.path().join(name), value.to_string()).unwrap();
     };
     damaged("v2.json", &|v| v["schema"] = 2.into());
-    refuse(&photos, "v2.json", "a registration of version 2, and 1 is known");
+    refuse(&photos, "v2.json", "a registration of version 2; version 1 is supported");
     damaged("focal.json", &|v| v["photographs"][0]["camera"]["fx"] = 1e12.into());
     refuse(&photos, "focal.json", "photograph 0: fx is 1000000000000");
     damaged("negative.json", &|v| v["photographs"][2]["camera"]["fy"] = (-3.0).into());
@@ -326,9 +326,9 @@ fn registrations_of_other_photographs_and_damaged_ones_are_refused() {
     damaged("large.json", &|v| v["photographs"][0]["width"] = u64::MAX.into());
     refuse(&photos, "large.json", "photograph 0: width is");
     damaged("scaled.json", &|v| v["photographs"][1]["from_world"][0][0] = 1.5.into());
-    refuse(&photos, "scaled.json", "the matrix of photograph 1 is no rotation");
+    refuse(&photos, "scaled.json", "the matrix of photograph 1 is not a rotation");
     damaged("pair.json", &|v| v["overlaps"][0]["b"] = 3.into());
-    refuse(&photos, "pair.json", "of 3 are no pair of placed ones");
+    refuse(&photos, "pair.json", "of 3 are not a pair of registered photographs");
     damaged("null.json", &|v| v["rms_px"] = serde_json::Value::Null);
     refuse(&photos, "null.json", "null.json is no registration");
     for (name, text) in [

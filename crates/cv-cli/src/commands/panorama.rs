@@ -1,4 +1,4 @@
-//! `cv panorama`: overlapping photographs to one picture.
+//! `cv panorama`: stitches overlapping photographs.
 
 mod registration;
 mod report;
@@ -18,10 +18,10 @@ use serde_json::json;
 use std::collections::btree_map::{BTreeMap, Entry};
 use std::path::{Path, PathBuf};
 
-/// What a panorama may be written as.
+/// Output formats of a panorama.
 const ENDINGS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff", "exr"];
 
-/// Join overlapping photographs to one picture.
+/// Stitch overlapping photographs to a panorama.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv panorama IMG_*.jpg -o pano.png\n  \
@@ -39,68 +39,67 @@ const ENDINGS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff", "exr"];
     cv panorama rig/frame2/ -o second.png --registration rig.json\n  \
     cv panorama holiday/ -o pano.png --save-registration holiday.pto")]
 pub(crate) struct Args {
-    /// Photographs in any order, or folders of them. Those that do not belong are left out.
+    /// Photographs in any order, or folders of them. Those that overlap no others are left out.
     #[arg(required = true, value_name = "IMAGES")]
     images: Vec<PathBuf>,
-    /// Where to write the panorama: .png, .tif or .jpg; the first two have 16 bits a channel where a photograph has. Or .exr, the light of the scene: linear, 32-bit floats, the
-    /// camera's curve, exposures and vignetting undone, what one photograph clipped taken from another that did not. There 1 is the light that is white in the middle of the photograph that
-    /// all others are aligned to, and brighter light is more.
+    /// Output file: .png, .tif or .jpg; the first two with 16 bits per channel if a photograph has. Or .exr, the linear scene radiance as 32-bit floats: camera response, exposure and
+    /// vignetting removed, clipped pixels filled from photographs that are not clipped there. A radiance of 1 is white at the center of the reference photograph.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// What the photographs are of: all around one place (rotation), or something flat from many places, such as a map, a wall or the ground (plane), drawn as a
-    /// plan, without shear; auto: rotation, unless plane explains the matches far better.
+    /// Motion model: a camera rotating about its center (rotation), or a planar scene such as a map, a wall or the ground from many positions (plane), which is
+    /// rectified; auto: rotation, unless the residuals of plane are far smaller.
     #[arg(long, value_name = "WHAT", value_parser = named::<CameraMotion>(), default_value_t = PanoramaOptions::default().align.motion)]
     mode: CameraMotion,
-    /// The surface to draw on; auto: a plane up to 90 degrees across, then a cylinder, a sphere where it is also high. Mercator keeps shapes (up to 85 degrees from the horizon),
-    /// panini shows a wide view with straight verticals as painters do (up to 240 degrees across), stereographic keeps shapes up to 150 degrees from its middle: with --center 0,-90 a
-    /// little planet. What lies beyond is not drawn.
+    /// Projection; auto: a plane up to a field of view of 90 degrees, then a cylinder, or a sphere if it is also high. Mercator is conformal (up to 85 degrees from the horizon),
+    /// panini keeps verticals straight (up to 240 degrees wide), stereographic is conformal (up to 150 degrees from the center): with --center 0,-90 a little planet. The panorama is
+    /// clipped to these limits.
     #[arg(long, value_name = "SURFACE", value_parser = named::<Projection>(), default_value_t = PanoramaOptions::default().render.projection)]
     projection: Projection,
-    /// Field of view of the picture, in degrees, across and, after a comma, from top to bottom; empty where no photograph reaches [default: as far as they reach].
+    /// Field of view in degrees: horizontal and, after a comma, vertical; empty where no photograph covers it [default: the extent of the photographs].
     #[arg(long, value_name = "ACROSS[,UP]", value_parser = field_of_view)]
     fov: Option<(f64, Option<f64>)>,
-    /// Where the middle of the surface looks, in degrees to the right of the middle of the photographs and above the horizon. The surface is turned there: only a picture
-    /// with 0 after the comma has a straight horizon [default: their middle].
+    /// Direction of the projection center: yaw in degrees to the right of the center of the photographs, and pitch above the horizon. The surface is rotated: the horizon
+    /// is straight only for a pitch of 0 [default: the center of the photographs].
     #[arg(long, value_name = "YAW,PITCH", value_parser = center, allow_hyphen_values = true)]
     center: Option<(f64, f64)>,
-    /// Turn the picture clockwise, in degrees, where the horizon is not level.
+    /// Clockwise rotation in degrees, to level the horizon.
     #[arg(long, value_name = "DEGREES", value_parser = roll, allow_hyphen_values = true, default_value_t = 0.0)]
     roll: f64,
-    /// How to join photographs at the seams.
+    /// Blending at the seams.
     #[arg(long, value_name = "MODE", value_parser = named::<BlendMode>(), default_value_t = PanoramaOptions::default().render.blend)]
     blend: BlendMode,
-    /// Where seams run: where the photographs agree, or half-way between their middles.
+    /// Seam finding: where the photographs agree (graphcut), or half-way between their centers (voronoi).
     #[arg(long, value_name = "WHERE", value_parser = named::<Seams>(), default_value_t = PanoramaOptions::default().render.seams)]
     seams: Seams,
-    /// Differences of light between photographs: left (none), or evened out in linear light, with the curve and the vignetting of the camera (match).
+    /// Exposure compensation: none, or exposure, white balance, camera response and vignetting estimated in linear radiance (match).
     #[arg(long, value_name = "WHAT", value_parser = named::<Exposure>(), default_value_t = PanoramaOptions::default().render.exposure)]
     exposure: Exposure,
-    /// Cut the result to the largest rectangle without empty pixels.
+    /// Crop to the largest rectangle without empty pixels.
     #[arg(long)]
     crop: bool,
-    /// Transparent instead of black where no photograph reaches; for .png and .tif.
+    /// Transparent instead of black where no photograph covers the panorama; for .png and .tif.
     #[arg(long)]
     alpha: bool,
-    /// Size relative to the photographs.
+    /// Resolution relative to the photographs.
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0)]
     scale: f64,
-    /// Features to match: sift for any photographs, harris for speed where they are all upright and of one size.
+    /// Features: sift for any photographs, harris for speed if all are upright and of one scale.
     #[arg(long, value_name = "KIND", value_parser = named::<FeatureMethod>(), default_value_t)]
     features: FeatureMethod,
-    /// The calibrated camera that took all of them (ours, OpenCV's, ROS's or Kalibr's YAML, COLMAP's cameras.txt): its focal length is believed and its distortion
-    /// taken out. Without, the focal length is estimated, from EXIF on.
+    /// Calibration of the camera (YAML of ours, OpenCV, ROS or Kalibr, COLMAP's cameras.txt): the intrinsics are kept constant and distortion is corrected
+    /// [default: the focal length is estimated, starting from EXIF].
     #[arg(long, value_name = "FILE")]
     camera: Option<PathBuf>,
-    /// Write where each photograph looks, and with what camera: .json for --registration, or .pto, a project for Hugin (of the photographs that are used).
+    /// Write the poses and intrinsics: .json for --registration, or .pto, a Hugin project (of the registered photographs).
     #[arg(long, value_name = "FILE")]
     save_registration: Option<PathBuf>,
-    /// Take where each photograph looks from a file of --save-registration, or from a project of Hugin's (.pto), in place of matching: for the next frames of a rig, or the same views in another light. As many
-    /// photographs, of the same sizes, in the same order.
+    /// Use the poses and intrinsics of a file of --save-registration, or of a Hugin project (.pto), instead of matching: for further frames of a rig, or the same views in another light. The
+    /// number, sizes and order of the photographs must be as registered.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["mode", "features", "camera"])]
     registration: Option<PathBuf>,
 }
 
-/// A number of degrees in a range.
+/// Parses an angle in degrees within a range.
 fn degrees(text: &str, range: std::ops::RangeInclusive<f64>) -> Result<f64, String> {
     let value = text.trim().parse().map_err(|_| format!("{text} is no number of degrees"))?;
     let (low, high) = (range.start(), range.end());
@@ -108,7 +107,7 @@ fn degrees(text: &str, range: std::ops::RangeInclusive<f64>) -> Result<f64, Stri
 }
 
 fn field_of_view(text: &str) -> Result<(f64, Option<f64>), String> {
-    // Less than a degree is a mistake for a factor, or radians.
+    // Less than a degree is probably a factor, or radians.
     let angle = |text| degrees(text, 1.0..=360.0);
     match text.split_once(',') {
         Some((across, up)) => Ok((angle(across)?, Some(angle(up)?))),
@@ -197,13 +196,13 @@ impl Run for Args {
 }
 
 impl Args {
-    /// Whether the panorama is to be of one of these kinds.
+    /// Returns whether the output has one of these extensions.
     fn ends_in(&self, endings: &[&str]) -> bool {
         let own = self.output.extension().unwrap_or_default();
         endings.iter().any(|ending| own.eq_ignore_ascii_case(ending))
     }
 
-    /// The panorama of photographs of which the focal lengths by EXIF and the metadata are known, in their own depth.
+    /// Stitches photographs of either bit depth, given their focal lengths by EXIF and metadata.
     fn join<T>(
         &self,
         paths: &[PathBuf],
@@ -217,7 +216,7 @@ impl Args {
         for<'a> ImageView<'a, T, 3>: PngPixels,
         for<'a> ImageView<'a, T, 4>: PngPixels,
     {
-        // Of photographs of one size the camera is read once.
+        // The camera is read once per image size.
         let mut cameras = BTreeMap::new();
         if let Some(path) = &self.camera {
             for image in images {
@@ -266,14 +265,14 @@ impl Args {
         if result.shows_parallax() {
             let rms = result.reprojection_rms_px;
             context.warn(format!(
-                "the photographs agree only to {rms:.1} px: they were taken from different places, and what is near may be cut in two at the seams"
+                "residuals of {rms:.1} px RMS indicate parallax: the photographs were taken from different positions, and near objects may be cut at the seams"
             ));
         }
         if result.reaches_beyond {
             let projection = result.canvas.projection;
             let [across, up] = projection.widest_field().map(f64::to_degrees);
             context.warn(format!(
-                "the photographs reach beyond the {across:.0} by {up:.0} degrees that the {projection} projection draws; --projection spherical draws all of them"
+                "the photographs reach beyond the {across:.0} by {up:.0} degrees of the {projection} projection; use --projection spherical to draw all of them"
             ));
         }
         context.report(|| {
@@ -284,7 +283,7 @@ impl Args {
     }
 }
 
-/// The metadata of the photograph that all others are aligned to; the color profile only where those used have the same.
+/// Returns the metadata of the reference photograph; the color profile only if all registered photographs have the same.
 fn metadata<T>(files: &[&Metadata], result: &PanoramaResult<T>) -> Metadata {
     let Some(reference) = files.get(result.alignment.reference) else { return Metadata::default() };
     let mut used = files.iter().zip(&result.images).filter(|(_, image)| image.used);
@@ -292,7 +291,7 @@ fn metadata<T>(files: &[&Metadata], result: &PanoramaResult<T>) -> Metadata {
     Metadata { exif: reference.exif.clone(), icc }
 }
 
-/// The picture, opaque where a photograph reaches and clear elsewhere.
+/// Adds an alpha channel: opaque where a photograph covers the panorama.
 fn transparent<T: PhotoSample>(result: &PanoramaResult<T>) -> Image<T, 4> {
     let (w, h) = result.image.size();
     Image::from_fn(w, h, |x, y| {
