@@ -249,6 +249,27 @@ fn fields_of_view_that_make_no_sense_are_refused_with_their_numbers() {
 }
 
 #[test]
+fn the_order_of_the_files_does_not_change_a_byte() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, names) = landscape(folder.path(), 4, 0.5);
+    let go = |order: &[usize], out: &str, more: &[&str]| {
+        let photos: Vec<&str> = order.iter().map(|i| names[*i].as_str()).collect();
+        let value = json(folder.path(), &[&["panorama"], &photos[..], &["-o", out, "--scale", "0.7"], more].concat());
+        // Everything is reported in the order of the arguments.
+        for (image, name) in value["images"].as_array().unwrap().iter().zip(&photos) {
+            assert_eq!(image["path"], **name);
+            assert_eq!(image["used"], true);
+        }
+        std::fs::read(folder.path().join(out)).unwrap()
+    };
+    let first = go(&[0, 1, 2, 3], "a.png", &[]);
+    assert!(first == go(&[3, 1, 0, 2], "b.png", &["--save-registration", "rig.json"]));
+    assert!(first == go(&[2, 0, 3, 1], "c.png", &["--threads", "1"]));
+    // A registration is of the photographs in its own order.
+    assert!(first == go(&[3, 1, 0, 2], "d.png", &["--registration", "rig.json"]));
+}
+
+#[test]
 fn a_saved_registration_gives_the_same_bytes_and_serves_other_frames() {
     let folder = tempfile::tempdir().unwrap();
     let (_, names) = landscape(folder.path(), 3, 0.0);

@@ -1,31 +1,32 @@
-//! Panoramas from overlapping photographs.
+//! The panorama job: features, matching, alignment and compositing.
+
+mod order;
+mod register;
 
 use crate::Progress;
-use crate::matching::{MatchingOptions, correspondences, extract_features, match_features, rescale};
-use cv_core::{
-    Camera, Cancelled, Correspondence, DMatch, Image, ImageView, Mask, RgbF32, Scaling, Stage, StageClock, UnionFind,
-};
-use cv_features::{FeatureError, FeatureOptions, Features, MatchError, SiftOptions};
+use crate::matching::{MatchingOptions, correspondences};
+use cv_core::{Camera, Cancelled, Correspondence, DMatch, Image, ImageView, Mask, RgbF32, StageClock};
+use cv_features::{FeatureError, FeatureOptions, Features, SiftOptions};
 use cv_panorama::{
-    AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, EightBits, NotAPair, Photo,
-    PhotoMap, PhotoSample, Registration, RegistrationError, RenderError, Unplaced, VerifiedPair, VerifyOptions, align,
-    render, verify_pair,
+    AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, EightBits, NotAPair, PhotoMap,
+    PhotoSample, Registration, RegistrationError, RenderError, Unplaced, VerifyOptions, render,
 };
-use rayon::prelude::*;
+use order::Order;
+use register::{Registered, register};
 
-/// A photograph and what is known about its camera.
+/// A photograph and prior knowledge of its camera.
 #[derive(Debug, Clone, Copy)]
 pub struct PanoramaPhoto<'a, T = u8> {
     /// The pixels, upright, of `u8` or `u16` samples.
     pub image: ImageView<'a, T, 3>,
     /// Focal length in pixels from EXIF, where there is one.
     pub focal: Option<f64>,
-    /// The calibrated camera, where there is one; its lens distortion is taken out.
+    /// The calibrated camera, where there is one; kept constant, and its distortion is corrected.
     pub camera: Option<Camera>,
 }
 
 impl<'a, T> PanoramaPhoto<'a, T> {
-    /// A photograph of which nothing else is known.
+    /// Creates a photograph of an unknown camera.
     pub fn new(image: ImageView<'a, T, 3>) -> Self {
         Self { image, focal: None, camera: None }
     }
@@ -34,17 +35,17 @@ impl<'a, T> PanoramaPhoto<'a, T> {
 /// Settings of [`panorama`].
 #[derive(Debug, Clone)]
 pub struct PanoramaOptions {
-    /// Features and matching. SIFT starts from the enlarged image ([`SiftOptions::upsample`]) and takes faint features ([`SiftOptions::min_features`]) only where the features of the plain one do not hold the photographs
-    /// together firmly.
+    /// Features and matching. SIFT uses the upsampled octave ([`SiftOptions::upsample`]) and low-contrast features ([`SiftOptions::min_features`]) only where the photographs are not
+    /// connected by enough inliers without.
     pub matching: MatchingOptions,
-    /// Pixels that photographs are reduced to (about) for features and alignment. 10,000 or more; default 800,000, in the range that OpenCV's stitcher
-    /// and Hugin's control point finders use.
+    /// Approximate number of pixels to which photographs are resized for features and alignment. 10,000 or more; default 800,000, similar to OpenCV's stitcher
+    /// and Hugin's control point finders.
     pub registration_pixels: usize,
-    /// Which pairs overlap. The threshold is in pixels of the reduced photographs.
+    /// Verification of pairs. The threshold is in pixels of the resized photographs.
     pub verify: VerifyOptions,
-    /// Alignment. `outlier_px` is in pixels of the reduced photographs.
+    /// Alignment. `outlier_px` is in pixels of the resized photographs.
     pub align: AlignOptions,
-    /// Drawing.
+    /// Compositing.
     pub render: CompositingOptions,
 }
 
@@ -64,8 +65,8 @@ impl Default for PanoramaOptions {
 }
 
 impl PanoramaOptions {
-    /// A method's options as panoramas want them: 2000 features at most, and faint ones where strong ones are few, as in a photograph that is two stops too dark.
-    /// [`panorama`] looks for those only where the photographs do not hang together firmly without.
+    /// Adapts a method's options to panoramas: at most 2000 features, and low-contrast ones where there are few, as in a photograph underexposed by two stops.
+    /// [`panorama`] uses those only where the photographs are not connected by enough inliers without.
     pub fn features(method: FeatureOptions) -> FeatureOptions {
         match method.at_most(2000) {
             FeatureOptions::Sift(sift) => {
@@ -76,61 +77,61 @@ impl PanoramaOptions {
     }
 }
 
-/// Why a photograph is not in the panorama.
+/// Why a photograph is not registered.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum LeftOut {
-    /// Features could not be looked for on it.
+    /// Feature extraction failed.
     Features(FeatureError),
-    /// No features were found on it.
+    /// It has no features.
     NoFeatures,
-    /// It overlaps no other photograph.
+    /// It has no verified pair.
     NoOverlap {
-        /// The pair with another photograph that came nearest to being one, where one came near.
+        /// The rejected pair with the most inliers, if any.
         nearest: Option<NearestPair>,
     },
-    /// It overlaps only photographs that do not overlap those of the panorama.
+    /// It belongs to a smaller connected component of the match graph.
     OtherComponent {
-        /// Photographs in that group, itself included.
+        /// Photographs in that component, itself included.
         size: usize,
     },
-    /// Its overlaps contradict those of the other photographs.
+    /// Its pairs are inconsistent with those of the other photographs.
     Inconsistent,
 }
 
-/// A pair of photographs of which too few matches agree.
+/// A pair rejected for too few inliers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct NearestPair {
     /// The other photograph.
     pub other: usize,
-    /// Matches that agree.
+    /// Number of inliers.
     pub agree: usize,
-    /// Matches where the two photographs overlap by the homography.
+    /// Number of matches inside the overlap by the homography.
     pub in_overlap: usize,
-    /// The number that chance explains; more would have to agree.
+    /// Number of inliers expected by chance, which must be exceeded.
     pub needed: f64,
 }
 
-/// What became of a photograph.
+/// Result for one photograph.
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub struct PanoramaImage {
     /// Width and height in pixels.
     pub size: (usize, usize),
-    /// Whether it is in the panorama.
+    /// Whether it is registered.
     pub used: bool,
-    /// Why not, where it is not.
+    /// Why it is not registered.
     pub reason: Option<LeftOut>,
-    /// Features found on it; 0 where nobody looked for any ([`panorama_with`]).
+    /// Number of features; 0 for [`panorama_with`].
     pub features: usize,
-    /// Its focal length in pixels, where it is used.
+    /// Focal length in pixels, where it is registered.
     pub focal: Option<f64>,
-    /// What its red, green and blue light was multiplied with.
+    /// Factors on its linear red, green and blue.
     pub gain: [f32; 3],
 }
 
-/// What became of a pair of photographs.
+/// Result for one pair of photographs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PanoramaPair {
     /// First photograph.
@@ -139,49 +140,48 @@ pub struct PanoramaPair {
     pub b: usize,
     /// Tentative matches, by the indices of the two photographs' features; see [`PanoramaResult::correspondences`].
     pub matches: Vec<DMatch>,
-    /// Indices of those that agree with a common homography, ascending; none where the pair was rejected.
+    /// Indices of the inliers of the homography, ascending; empty where the pair was rejected.
     pub inliers: Vec<usize>,
     /// Why the pair was rejected.
     pub rejected: Option<NotAPair>,
 }
 
-/// A panorama and how it came about.
+/// A panorama with its registration and matches.
 #[derive(Debug, Clone)]
 pub struct PanoramaResult<T = u8> {
-    /// The picture, as deep as the photographs; black where no photograph reaches.
+    /// The image, of the bit depth of the photographs; black where no photograph covers it.
     pub image: Image<T, 3>,
-    /// The light of the scene, linear, where [`CompositingOptions::radiance`] asks for it; 1 is the white of the photograph that all others are aligned to.
+    /// Linear scene radiance, if requested by [`CompositingOptions::radiance`]; 1 is white in the reference photograph.
     pub radiance: Option<RgbF32>,
-    /// True where a photograph reaches.
+    /// True where a photograph covers the pixel.
     pub mask: Mask,
-    /// Which photograph each pixel is from; `u16::MAX` where none reaches.
+    /// Index of the photograph of each pixel; `u16::MAX` where none covers it.
     pub labels: Image<u16, 1>,
     /// One entry per input.
     pub images: Vec<PanoramaImage>,
-    /// All pairs that had matches; none of [`panorama_with`].
+    /// All pairs with matches; empty for [`panorama_with`].
     pub pairs: Vec<PanoramaPair>,
-    /// Features of each photograph, in its own pixels; none of [`panorama_with`].
+    /// Features of each photograph, in its own pixels; empty for [`panorama_with`].
     pub features: Vec<Features>,
-    /// The views, in full size.
+    /// The alignment of the photographs at full size.
     pub alignment: Alignment,
-    /// The surface drawn on, and where each pixel of the picture looks.
+    /// Projection geometry.
     pub canvas: Canvas,
-    /// Where in its photograph each pixel of the picture comes from.
+    /// Map from panorama pixels to photograph pixels.
     pub map: PhotoMap,
-    /// Whether photographs reach beyond what the surface draws at the most, and no field of view was asked for.
+    /// Whether photographs extend beyond the maximum field of view of the projection and none was requested.
     pub reaches_beyond: bool,
-    /// Root mean square error of all matches of all overlaps, in pixels of the photographs.
+    /// Root mean square transfer error of all matches, in pixels of the photographs.
     pub reprojection_rms_px: f64,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
 
-/// Share of a photograph's longer side by which matches disagree when the camera clearly moved: 5 px of 1,000. Features are good to a pixel or two; parallax
-/// is what is left.
-const PARALLAX: f64 = 0.005;
+/// Root mean square transfer error, relative to the longer side of a photograph, above which parallax is reported: 5 px of 1,000.
+const MIN_PARALLAX_RATIO: f64 = 0.005;
 
 impl<T> PanoramaResult<T> {
-    /// Where the matches of a pair are, in pixels of the photographs.
+    /// Returns the positions of the matches of a pair, in pixels of the photographs.
     ///
     /// # Panics
     /// For a pair of another panorama.
@@ -189,19 +189,19 @@ impl<T> PanoramaResult<T> {
         correspondences(&self.features[pair.a], &self.features[pair.b], &pair.matches)
     }
 
-    /// Where the photographs look, for others of the same views; `names` are those of the photographs, as many as are known.
+    /// Returns the registration for other photographs of the same cameras; `names` are those of the photographs, as many as are known.
     ///
     /// # Errors
-    /// [`RegistrationError`] where a camera or a matrix is out of the range that registrations take.
+    /// [`RegistrationError`] where a parameter is out of range.
     pub fn registration(&self, names: &[String]) -> Result<Registration, RegistrationError> {
         let sizes: Vec<_> = self.images.iter().map(|image| image.size).collect();
         Registration::new(&self.alignment, &sizes, names)
     }
 
-    /// Whether the photographs fit each other so badly that they must have been taken from different places: what is near may then be cut in two at the seams.
+    /// Returns whether the residuals show parallax: the camera moved, and near objects may be cut at the seams.
     pub fn shows_parallax(&self) -> bool {
         let longest = self.alignment.used().map(|(_, view)| view.camera.width.max(view.camera.height)).max();
-        self.reprojection_rms_px > PARALLAX * longest.unwrap_or(0) as f64
+        self.reprojection_rms_px > MIN_PARALLAX_RATIO * longest.unwrap_or(0) as f64
     }
 }
 
@@ -209,7 +209,7 @@ impl<T> PanoramaResult<T> {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum PanoramaError {
-    /// The photographs could not be aligned. `images` says for each what is the matter with it.
+    /// The photographs could not be aligned. `images` has the reason for each.
     #[error("{source}")]
     Align {
         /// Why.
@@ -217,10 +217,10 @@ pub enum PanoramaError {
         /// One entry per input.
         images: Vec<PanoramaImage>,
     },
-    /// The photographs are not as they were registered.
+    /// The photographs do not fit the registration.
     #[error(transparent)]
     Registration(#[from] RegistrationError),
-    /// The panorama could not be drawn.
+    /// Compositing failed.
     #[error(transparent)]
     Render(RenderError),
     /// The job was stopped by its progress callback.
@@ -237,11 +237,10 @@ impl From<RenderError> for PanoramaError {
     }
 }
 
-/// Joins overlapping photographs, in any order, to a panorama.
+/// Stitches overlapping photographs, in any order, to a panorama.
 ///
-/// Features on reduced photographs, matches of every pair, verification of the pairs (all of it again with finer features where some hold only loosely),
-/// alignment of all at once, drawing in full size. Photographs that do not belong are left out and say why. They are of `u8` or of `u16` samples, and so is the panorama; where they belong
-/// is found on 8 bits of them.
+/// Extracts features on resized photographs, matches and verifies all pairs (repeated with more features where the connections are weak), aligns by bundle adjustment, and composites at
+/// full size. Photographs without a consistent pair are left out with the reason. The panorama has the sample type of the photographs, `u8` or `u16`; alignment uses 8 bits.
 ///
 /// # Errors
 /// [`PanoramaError`]: fewer than two photographs belong together, or the canvas would be too large.
@@ -251,91 +250,25 @@ pub fn panorama<T: PhotoSample>(
     progress: &dyn Progress,
 ) -> Result<PanoramaResult<T>, PanoramaError> {
     let views: Vec<_> = photos.iter().map(|photo| photo.image).collect();
-    let found = {
-        let eight = EightBits::new(&views, "features", progress)?;
-        let bytes = eight.views().into_iter().zip(photos);
-        let bytes: Vec<_> = bytes.map(|(image, p)| PanoramaPhoto { image, focal: p.focal, camera: p.camera }).collect();
-        register(&bytes, options, progress)?
-    };
-    draw(&views, found, &options.render, progress)
-}
-
-/// What is known of photographs before the panorama is drawn.
-struct Registered {
-    alignment: Alignment,
-    images: Vec<PanoramaImage>,
-    pairs: Vec<PanoramaPair>,
-    features: Vec<Features>,
-    clock: StageClock,
-}
-
-/// Where photographs belong, from their features.
-fn register(
-    photos: &[PanoramaPhoto<'_>],
-    options: &PanoramaOptions,
-    progress: &dyn Progress,
-) -> Result<Registered, PanoramaError> {
-    let mut clock = StageClock::new();
-    let n = photos.len();
-    let candidates: Vec<(usize, usize)> = (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b))).collect();
-    let mut look = |matching: &MatchingOptions| -> Result<(Vec<Prepared>, Vec<Option<Tried>>), Cancelled> {
-        let stage = Stage::new(progress, "features", n)?;
-        let extract = |p| -> Result<Prepared, Cancelled> {
-            let prepared = Prepared::new(p, matching, options.registration_pixels, &stage)?;
-            stage.add(1)?;
-            Ok(prepared)
+    let order = Order::of(&views);
+    let (photos, views) = (order.sorted(photos), order.sorted(&views));
+    let stitch = || {
+        let found = {
+            let eight = EightBits::new(&views, "features", progress)?;
+            let bytes = eight.views().into_iter().zip(&photos);
+            let bytes: Vec<_> =
+                bytes.map(|(image, p)| PanoramaPhoto { image, focal: p.focal, camera: p.camera }).collect();
+            register(&bytes, options, progress)?
         };
-        let prepared: Vec<Prepared> = photos.par_iter().map(extract).collect::<Result<_, _>>()?;
-        clock.lap("features");
-        let stage = Stage::new(progress, "match", candidates.len())?;
-        let compare = |&(a, b): &(usize, usize)| -> Result<Option<Tried>, Cancelled> {
-            let pair = try_pair(&prepared, a, b, options, &stage)?;
-            stage.add(1)?;
-            Ok(pair)
-        };
-        let tried = candidates.par_iter().map(compare).collect::<Result<_, _>>()?;
-        clock.lap("match");
-        Ok((prepared, tried))
+        composite(&views, found, &options.render, progress)
     };
-    let matching = &options.matching;
-    // The enlarged image is most of the work of SIFT, faint features are less exact: both are seldom needed.
-    let plain = match &matching.features {
-        FeatureOptions::Sift(sift) if sift.upsample => {
-            let features = FeatureOptions::Sift(SiftOptions { upsample: false, min_features: 0, ..sift.clone() });
-            Some(MatchingOptions { features, ..matching.clone() })
-        }
-        _ => None,
-    };
-    let (mut prepared, mut tried) = look(plain.as_ref().unwrap_or(matching))?;
-    if plain.is_some() && !held_firmly(n, &tried) {
-        (prepared, tried) = look(matching)?;
-    }
-    let (pairs, verified): (Vec<PanoramaPair>, Vec<Option<VerifiedPair>>) = tried.into_iter().flatten().unzip();
-    let verified: Vec<VerifiedPair> = verified.into_iter().flatten().collect();
-    let known: Vec<Photo> = prepared.iter().map(|p| p.photo).collect();
-    let alignment = match align(&known, &verified, &options.align, progress) {
-        Ok(alignment) => alignment,
-        Err(AlignError::Cancelled(stop)) => return Err(stop.into()),
-        Err(source) => {
-            let views = vec![Err(Unplaced::NoOverlap); n];
-            return Err(PanoramaError::Align { source, images: describe(&prepared, &views, &pairs) });
-        }
-    };
-    let mut images = describe(&prepared, &alignment.views, &pairs);
-    let sizes: Vec<_> = prepared.iter().zip(photos).map(|(p, photo)| (p.factor, photo.image.size())).collect();
-    for (image, (_, size)) in images.iter_mut().zip(&sizes) {
-        image.size = *size;
-    }
-    let alignment = alignment.resized(&sizes);
-    clock.lap("align");
-    let features = prepared.into_iter().map(Prepared::into_features).collect();
-    Ok(Registered { alignment, images, pairs, features, clock })
+    stitch().map(|result| order.restored_result(result)).map_err(|error| order.restored_error(error))
 }
 
-/// Joins photographs whose views are known from others: the next frames of a rig, another exposure of the same views.
+/// Stitches photographs with a known registration: further frames of a rig, another exposure of the same views.
 ///
-/// As [`panorama`] without features, matches and alignment; light, seams and local deformations are those of these photographs, so that the photographs that were registered give the same bytes
-/// again. As many photographs, of the same sizes, in the same order.
+/// As [`panorama`] without features, matching and alignment; exposure, seams and local alignment are estimated for these photographs, so that the registered photographs give the same bytes
+/// again. Number, sizes and order of the photographs must be as registered.
 ///
 /// # Errors
 /// [`PanoramaError`]: the photographs are not as registered, or the canvas would be too large.
@@ -347,7 +280,9 @@ pub fn panorama_with<T: PhotoSample>(
 ) -> Result<PanoramaResult<T>, PanoramaError> {
     let sizes: Vec<_> = photos.iter().map(ImageView::size).collect();
     registration.check_photographs(&sizes)?;
-    let alignment = registration.alignment();
+    let order = Order::of(photos);
+    let (photos, sizes) = (order.sorted(photos), order.sorted(&sizes));
+    let alignment = order.sorted_alignment(registration.alignment());
     let images = alignment.views.iter().zip(&sizes).map(|(view, &size)| PanoramaImage {
         size,
         used: view.is_ok(),
@@ -362,11 +297,11 @@ pub fn panorama_with<T: PhotoSample>(
     });
     let images = images.collect();
     let found = Registered { alignment, images, pairs: Vec::new(), features: Vec::new(), clock: StageClock::new() };
-    draw(photos, found, options, progress)
+    composite(&photos, found, options, progress).map(|result| order.restored_result(result))
 }
 
-/// The picture, and what is to be told of it.
-fn draw<T: PhotoSample>(
+/// Composites the panorama and collects the result.
+fn composite<T: PhotoSample>(
     photos: &[ImageView<'_, T, 3>],
     found: Registered,
     options: &CompositingOptions,
@@ -398,148 +333,4 @@ fn draw<T: PhotoSample>(
         alignment,
         stages: clock.into_stages(),
     })
-}
-
-/// A photograph ready to be matched.
-struct Prepared {
-    /// In pixels of the reduced photograph.
-    photo: Photo,
-    /// Size of the photograph over that of the reduced one.
-    factor: f64,
-    features: Features,
-    /// Why it has no features.
-    failure: Option<FeatureError>,
-}
-
-impl Prepared {
-    fn new(
-        p: &PanoramaPhoto<'_>,
-        matching: &MatchingOptions,
-        registration_pixels: usize,
-        progress: &dyn Progress,
-    ) -> Result<Self, Cancelled> {
-        let (w, h) = p.image.size();
-        let factor = ((w * h) as f64 / registration_pixels.max(10_000) as f64).sqrt().max(1.0);
-        let size = ((w as f64 / factor).round() as usize, (h as f64 / factor).round() as usize);
-        let reduced = (factor > 1.2).then(|| cv_imgproc::resize_area(p.image, size.0, size.1).ok()).flatten();
-        let (image, factor) = match &reduced {
-            Some(small) => (small.view(), w as f64 / size.0 as f64),
-            None => (p.image, 1.0),
-        };
-        let (features, failure) = match extract_features(image, &matching.features, progress) {
-            Ok(features) => (features, None),
-            Err(FeatureError::Cancelled(stop)) => return Err(stop),
-            Err(error) => (Features::new(matching.features.extractor().kind()), Some(error)),
-        };
-        let (width, height) = image.size();
-        let camera = p.camera.map(|c| Camera { width, height, ..c.scaled(1.0 / factor) });
-        let photo = Photo { width, height, focal: p.focal.map(|f| f / factor), camera };
-        Ok(Self { photo, factor, features, failure })
-    }
-
-    /// In pixels of the photograph.
-    fn into_features(mut self) -> Features {
-        rescale(&mut self.features, Scaling::uniform(self.factor));
-        self.features
-    }
-}
-
-/// A pair that was matched, and what verification left of it.
-type Tried = (PanoramaPair, Option<VerifiedPair>);
-
-/// Agreeing matches that hold two photographs together firmly. On sixteen rendered sets, whose links had 66 and more, neighbors then lie within 0.16 px of the
-/// truth (0.08 px median at 480 px, 0.05 px at 800 px); with those of the enlarged image too, within 0.08 px (0.04 px median), at twice the time for features.
-const FIRM: usize = 50;
-
-/// Whether all photographs hang together by links that are firm.
-fn held_firmly(n: usize, tried: &[Option<Tried>]) -> bool {
-    let verified = tried.iter().flatten().filter_map(|(_, verified)| verified.as_ref());
-    let firm = verified.filter(|v| v.inliers.len() >= FIRM);
-    let mut sets = UnionFind::new(n);
-    firm.filter(|v| sets.union(v.a as u32, v.b as u32)).count() + 1 >= n
-}
-
-/// Matches and verifies a pair; `None` where one has no features.
-fn try_pair(
-    prepared: &[Prepared],
-    a: usize,
-    b: usize,
-    options: &PanoramaOptions,
-    progress: &dyn Progress,
-) -> Result<Option<Tried>, Cancelled> {
-    let (p, q) = (&prepared[a], &prepared[b]);
-    let matches = match match_features(&p.features, &q.features, &options.matching, progress) {
-        Ok(matches) => matches,
-        Err(MatchError::Cancelled(stop)) => return Err(stop),
-        Err(_) => return Ok(None),
-    };
-    let pixels = correspondences(&p.features, &q.features, &matches);
-    let size = |p: &Prepared| (p.photo.width, p.photo.height);
-    let verified = verify_pair((a, size(p)), (b, size(q)), &pixels, &options.verify);
-    let (verified, rejected) = match verified {
-        Ok(pair) => (Some(pair), None),
-        Err(reason) => (None, Some(reason)),
-    };
-    let inliers = verified.as_ref().map(|v| v.inliers.clone()).unwrap_or_default();
-    Ok(Some((PanoramaPair { a, b, matches, inliers, rejected }, verified)))
-}
-
-/// What to tell about each photograph.
-fn describe(
-    prepared: &[Prepared],
-    views: &[Result<cv_panorama::View, Unplaced>],
-    pairs: &[PanoramaPair],
-) -> Vec<PanoramaImage> {
-    let nearest = |i: usize| {
-        let miss = |p: &PanoramaPair| match p.rejected {
-            Some(NotAPair::TooFewAgree { agree, in_overlap, needed }) if p.a == i || p.b == i => {
-                Some(NearestPair { other: if p.a == i { p.b } else { p.a }, agree, in_overlap, needed })
-            }
-            _ => None,
-        };
-        pairs.iter().filter_map(miss).max_by_key(|miss| miss.agree)
-    };
-    let reason = |i: usize, why: Unplaced| match (why, &prepared[i].failure) {
-        (_, Some(failure)) => LeftOut::Features(*failure),
-        (Unplaced::OtherComponent { size }, _) => LeftOut::OtherComponent { size },
-        (Unplaced::Inconsistent, _) => LeftOut::Inconsistent,
-        (Unplaced::NoOverlap, _) if prepared[i].features.keypoints.is_empty() => LeftOut::NoFeatures,
-        (Unplaced::NoOverlap, _) => LeftOut::NoOverlap { nearest: nearest(i) },
-    };
-    views
-        .iter()
-        .enumerate()
-        .map(|(i, view)| PanoramaImage {
-            size: (prepared[i].photo.width, prepared[i].photo.height),
-            used: view.is_ok(),
-            reason: view.as_ref().err().map(|why| reason(i, *why)),
-            features: prepared[i].features.keypoints.len(),
-            focal: None,
-            gain: [1.0; 3],
-        })
-        .collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use cv_core::Matrix3;
-
-    #[test]
-    fn photographs_hold_firmly_where_firm_links_connect_them_all() {
-        let link = |a: usize, b: usize, agree: usize| {
-            let pair = PanoramaPair { a, b, matches: Vec::new(), inliers: Vec::new(), rejected: None };
-            let (inliers, matches) = ((0..agree).collect(), vec![Correspondence::new(0.0, 0.0, 0.0, 0.0); agree]);
-            Some((pair, Some(VerifiedPair { a, b, homography: Matrix3::identity(), inliers, matches })))
-        };
-        let rejected = || {
-            let pair = PanoramaPair { a: 0, b: 1, matches: Vec::new(), inliers: Vec::new(), rejected: None };
-            Some((pair, None))
-        };
-        assert!(held_firmly(0, &[]) && held_firmly(1, &[]));
-        assert!(!held_firmly(2, &[None]) && !held_firmly(2, &[rejected()]));
-        assert!(held_firmly(3, &[link(1, 2, FIRM), None, link(0, 2, FIRM), link(0, 1, 9)]));
-        // Two firm pairs and a loose link between them.
-        assert!(!held_firmly(4, &[link(2, 3, FIRM), link(0, 1, 900), link(0, 2, FIRM - 1)]));
-    }
 }
