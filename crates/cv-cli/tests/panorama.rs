@@ -249,6 +249,27 @@ fn fields_of_view_that_make_no_sense_are_refused_with_their_numbers() {
 }
 
 #[test]
+fn the_order_of_the_files_does_not_change_a_byte() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, names) = landscape(folder.path(), 4, 0.5);
+    let go = |order: &[usize], out: &str, more: &[&str]| {
+        let photos: Vec<&str> = order.iter().map(|i| names[*i].as_str()).collect();
+        let value = json(folder.path(), &[&["panorama"], &photos[..], &["-o", out, "--scale", "0.7"], more].concat());
+        // Everything is reported in the order of the arguments.
+        for (image, name) in value["images"].as_array().unwrap().iter().zip(&photos) {
+            assert_eq!(image["path"], **name);
+            assert_eq!(image["used"], true);
+        }
+        std::fs::read(folder.path().join(out)).unwrap()
+    };
+    let first = go(&[0, 1, 2, 3], "a.png", &[]);
+    assert!(first == go(&[3, 1, 0, 2], "b.png", &["--save-registration", "rig.json"]));
+    assert!(first == go(&[2, 0, 3, 1], "c.png", &["--threads", "1"]));
+    // A registration is of the photographs in its own order.
+    assert!(first == go(&[3, 1, 0, 2], "d.png", &["--registration", "rig.json"]));
+}
+
+#[test]
 fn a_saved_registration_gives_the_same_bytes_and_serves_other_frames() {
     let folder = tempfile::tempdir().unwrap();
     let (_, names) = landscape(folder.path(), 3, 0.0);
@@ -318,7 +339,7 @@ fn registrations_of_other_photographs_and_damaged_ones_are_refused() {
         std::fs::write(folder.path().join(name), value.to_string()).unwrap();
     };
     damaged("v2.json", &|v| v["schema"] = 2.into());
-    refuse(&photos, "v2.json", "a registration of version 2, and 1 is known");
+    refuse(&photos, "v2.json", "a registration of version 2; version 1 is supported");
     damaged("focal.json", &|v| v["photographs"][0]["camera"]["fx"] = 1e12.into());
     refuse(&photos, "focal.json", "photograph 0: fx is 1000000000000");
     damaged("negative.json", &|v| v["photographs"][2]["camera"]["fy"] = (-3.0).into());
@@ -326,9 +347,9 @@ fn registrations_of_other_photographs_and_damaged_ones_are_refused() {
     damaged("large.json", &|v| v["photographs"][0]["width"] = u64::MAX.into());
     refuse(&photos, "large.json", "photograph 0: width is");
     damaged("scaled.json", &|v| v["photographs"][1]["from_world"][0][0] = 1.5.into());
-    refuse(&photos, "scaled.json", "the matrix of photograph 1 is no rotation");
+    refuse(&photos, "scaled.json", "the matrix of photograph 1 is not a rotation");
     damaged("pair.json", &|v| v["overlaps"][0]["b"] = 3.into());
-    refuse(&photos, "pair.json", "of 3 are no pair of placed ones");
+    refuse(&photos, "pair.json", "of 3 are not a pair of registered photographs");
     damaged("null.json", &|v| v["rms_px"] = serde_json::Value::Null);
     refuse(&photos, "null.json", "null.json is no registration");
     for (name, text) in [

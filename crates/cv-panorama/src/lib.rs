@@ -1,13 +1,13 @@
-//! Projections, alignment, exposure, seams and blending of overlapping photographs.
+//! Image stitching: alignment, projection, exposure compensation, seam finding and blending of overlapping photographs.
 //!
-//! Takes matches, never detectors: `cv-pipeline` joins the two. From matches of pairs to the picture in three steps,
+//! Takes matches, never detectors: `cv-pipeline` joins the two. From tentative matches to the panorama in three steps,
 //! [`verify_pair`], [`align`], [`render`]:
 //!
 //! ```
 //! use cv_core::{Correspondence, RgbU8, Silent};
 //! use cv_panorama::{AlignOptions, CameraMotion, Photo, CompositingOptions, VerifyOptions, align, render, verify_pair};
 //!
-//! // Two windows, 60 pixels apart, of one picture; matches on a grid.
+//! // Two windows of one image, 60 pixels apart; matches on a grid.
 //! let scene = |x: usize, y: usize| [(x * 2 % 256) as u8, (y * 3 % 256) as u8, ((x * y) % 256) as u8];
 //! let left = RgbU8::from_fn(160, 120, scene);
 //! let right = RgbU8::from_fn(160, 120, |x, y| scene(x + 60, y));
@@ -27,15 +27,15 @@
 //!
 //! # Conventions
 //!
-//! * A [`View`] maps world rays to a photograph's pixels: `pixel ~ camera(from_world · ray)`. World frame: X right, Y down, Z to the
-//!   middle of the panorama.
-//! * The order of photographs and pairs does not matter but for rounding.
+//! * A [`View`] maps world rays to a photograph's pixels: `pixel ~ camera(from_world · ray)`. World frame: X right, Y down, Z toward the
+//!   center of the panorama.
+//! * The result does not depend on the order of photographs and pairs, up to rounding.
 //! * The same input and options give the same bytes at any number of threads.
 
 mod align;
+mod bit_depth;
 mod blend;
-mod depth;
-mod light;
+mod photometric;
 mod registration;
 mod render;
 mod rows;
@@ -44,12 +44,14 @@ mod surface;
 #[cfg(test)]
 mod testing;
 
-pub use align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, View, align};
+pub use align::{
+    AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, View, align, refine_alignment,
+};
+pub use bit_depth::{EightBits, PhotoSample};
 pub use blend::{BlendMode, Blender, Composition, NO_PHOTO};
 pub use cv_geometry::{PairRejection, VerifiedPair, VerifyOptions, verify_pair};
 pub use cv_imgproc::Interpolation;
-pub use depth::{EightBits, PhotoSample};
-pub use light::{Exposure, Gains};
+pub use photometric::{Exposure, Gains};
 pub use registration::{Pto, PtoError, Registration, RegistrationError};
 pub use render::{CompositingOptions, Panorama, RenderError, render, render_with};
 pub use seams::Seams;

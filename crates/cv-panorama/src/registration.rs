@@ -1,4 +1,4 @@
-//! A registration that outlives its photographs: where each photograph of a rig looks, for its next frames.
+//! Serializable registrations: the poses and intrinsics of a set of photographs, for further photographs of the same cameras.
 
 mod pto;
 
@@ -8,17 +8,17 @@ use crate::align::{AlignedPair, Alignment, CameraMotion, Unplaced, View};
 use cv_core::{Camera, CameraError, Correspondence, Distortion, DistortionModel, Matrix3, Named, OptionError};
 use serde::{Deserialize, Serialize};
 
-/// The version of the serialized form.
+/// Version of the serialized form.
 const SCHEMA: u32 = 1;
-/// Most pixels along a side of a photograph.
-const LONGEST_SIDE: usize = 1_000_000;
-/// Entries by which `R Rᵀ` may differ from 1: numbers that people shortened to eight digits.
-const ROUNDING: f64 = 1e-6;
+/// Maximum side of a photograph in pixels.
+const MAX_SIDE_PX: usize = 1_000_000;
+/// Tolerance on the entries of `R Rᵀ − I`: allows for rotations rounded to eight digits.
+const ORTHOGONALITY_TOLERANCE: f64 = 1e-6;
 
-/// Where each photograph looks and with what camera: an [`Alignment`] with the sizes and names of all photographs, whether or not they are used.
+/// Poses and intrinsics of a set of photographs: an [`Alignment`] with the sizes and names of all photographs, registered or not.
 ///
-/// Serializes with serde; what is loaded is checked. It holds for any photographs that the same cameras take from the same place, such as the frames of a rig: as many, of the same sizes, in the
-/// same order. Light and local deformations are not in it: they are measured anew on the photographs that are drawn.
+/// Serializes with serde; deserialization validates. It applies to any photographs that the same cameras take from the same position, such as the frames of a rig: the same number, sizes and
+/// order. Exposure and local alignment are not included; they are estimated for the photographs that are composited.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "RegistrationFile", into = "RegistrationFile")]
 pub struct Registration {
@@ -41,15 +41,15 @@ struct Photograph {
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum RegistrationError {
-    /// Of another version, or no registration.
-    #[error("a registration of version {}, and {known} is known", found.map_or_else(|| "unknown".to_owned(), |v| v.to_string()))]
+    /// Unknown version, or not a registration.
+    #[error("a registration of version {}; version {known} is supported", found.map_or_else(|| "unknown".to_owned(), |v| v.to_string()))]
     Schema {
         /// Its version, where it has one.
         found: Option<u64>,
-        /// The version that is known.
+        /// The supported version.
         known: u32,
     },
-    /// There are more or fewer photographs.
+    /// The number of photographs differs.
     #[error("{got} photographs for a registration of {registered}")]
     Count {
         /// Photographs registered.
@@ -57,7 +57,7 @@ pub enum RegistrationError {
         /// Photographs given.
         got: usize,
     },
-    /// A photograph is of another size.
+    /// The size of a photograph differs.
     #[error("photograph {index} is {width}x{height}; {registered_width}x{registered_height} was registered")]
     Size {
         /// Which.
@@ -71,22 +71,22 @@ pub enum RegistrationError {
         /// The height that was registered.
         registered_height: usize,
     },
-    /// No photograph is placed.
-    #[error("none of the {photographs} photographs of the registration is placed")]
+    /// No photograph is registered.
+    #[error("none of the {photographs} photographs of the registration is registered")]
     Nothing {
         /// Photographs registered.
         photographs: usize,
     },
-    /// A photograph's number is out of its range.
+    /// A parameter is out of range.
     #[error("photograph {index}: {source}")]
     Value {
         /// Which photograph.
         index: usize,
-        /// The number.
+        /// The parameter.
         #[source]
         source: OptionError,
     },
-    /// A photograph's camera is none.
+    /// A camera is invalid.
     #[error("photograph {index}: {source}")]
     Camera {
         /// Which photograph.
@@ -95,24 +95,24 @@ pub enum RegistrationError {
         #[source]
         source: CameraError,
     },
-    /// A photograph is of a lens that nobody knows, or that has another number of parameters.
-    #[error("photograph {index} has a lens that is not known, or {parameters} parameters, which is not its number")]
+    /// The distortion model is unknown or has another number of parameters.
+    #[error("photograph {index}: unknown distortion model, or {parameters} parameters do not fit it")]
     Lens {
         /// Which photograph.
         index: usize,
-        /// How many parameters it has.
+        /// Number of parameters found.
         parameters: usize,
     },
-    /// A photograph's matrix is no rotation, or cannot be inverted.
-    #[error("the matrix of photograph {index} is no {}", if *rotation { "rotation" } else { "homography" })]
+    /// A matrix is not a rotation, or is singular.
+    #[error("the matrix of photograph {index} is not a {}", if *rotation { "rotation" } else { "homography" })]
     Matrix {
         /// Which photograph.
         index: usize,
         /// Whether a rotation was needed.
         rotation: bool,
     },
-    /// A pair, or the reference, names a photograph that is not placed, or itself.
-    #[error("photographs {a} and {b} of {photographs} are no pair of placed ones")]
+    /// The indices of a pair, or of the reference, are equal or not registered.
+    #[error("photographs {a} and {b} of {photographs} are not a pair of registered photographs")]
     Pair {
         /// First of the pair, or the reference.
         a: usize,
@@ -124,10 +124,10 @@ pub enum RegistrationError {
 }
 
 impl Registration {
-    /// Of an alignment and the sizes and names of all its photographs; a name that is missing is empty.
+    /// Creates a registration from an alignment and the sizes and names of all photographs; missing names are empty.
     ///
     /// # Errors
-    /// [`RegistrationError`], where the alignment is not one of photographs of these sizes.
+    /// [`RegistrationError`] where the alignment does not fit the sizes.
     pub fn new(alignment: &Alignment, sizes: &[(usize, usize)], names: &[String]) -> Result<Self, RegistrationError> {
         if alignment.views.len() != sizes.len() {
             return Err(RegistrationError::Count { registered: alignment.views.len(), got: sizes.len() });
@@ -138,7 +138,7 @@ impl Registration {
                 .collect(),
             reference: alignment.reference,
             motion: alignment.motion,
-            // Which of the tentative matches they were, nobody asks any more.
+            // Indices into the tentative matches are not kept.
             pairs: alignment.pairs.iter().map(|p| AlignedPair { inliers: Vec::new(), ..p.clone() }).collect(),
             rms_px: alignment.rms_px,
             median_px: alignment.median_px,
@@ -147,7 +147,7 @@ impl Registration {
         Ok(made)
     }
 
-    /// The views, as [`render`](crate::render) takes them.
+    /// Returns the alignment, for [`render`](crate::render).
     pub fn alignment(&self) -> Alignment {
         Alignment {
             views: self.photographs.iter().map(|p| p.view).collect(),
@@ -159,17 +159,17 @@ impl Registration {
         }
     }
 
-    /// Number of photographs, whether or not they are used.
+    /// Returns the number of photographs, registered or not.
     pub fn photographs(&self) -> usize {
         self.photographs.len()
     }
 
-    /// The name that a photograph had; empty where it had none.
+    /// Returns the name of a photograph; empty where it has none.
     pub fn name(&self, photograph: usize) -> &str {
         self.photographs.get(photograph).map_or("", |p| &p.name)
     }
 
-    /// Whether photographs of these sizes are as registered.
+    /// Checks that photographs have the registered number and sizes.
     ///
     /// # Errors
     /// [`RegistrationError::Count`], [`RegistrationError::Size`].
@@ -186,7 +186,7 @@ impl Registration {
         Ok(())
     }
 
-    /// Whether a serialized registration is of the version that is known.
+    /// Checks the version of a serialized registration.
     ///
     /// # Errors
     /// [`RegistrationError::Schema`].
@@ -197,7 +197,7 @@ impl Registration {
         }
     }
 
-    /// Whether everything is a number in its range.
+    /// Validates all parameters.
     fn check(&self) -> Result<(), RegistrationError> {
         let photographs = self.photographs.len();
         if self.photographs.iter().all(|p| p.view.is_err()) {
@@ -222,7 +222,7 @@ impl Registration {
             for m in &pair.matches {
                 for (index, p, size) in [(pair.a, m.a, a.size), (pair.b, m.b, b.size)] {
                     for (v, side) in [(p.x, size.0), (p.y, size.1)] {
-                        // Corners of features may lie half a pixel outside of the pixels' centers.
+                        // Features may lie up to half a pixel outside the outer pixel centers.
                         OptionError::check("match", v, "on the photograph", |v| v >= -1.0 && v <= side as f64)
                             .map_err(|source| RegistrationError::Value { index, source })?;
                     }
@@ -241,7 +241,7 @@ impl Photograph {
         };
         let (width, height) = self.size;
         for (name, side) in [("width", width), ("height", height)] {
-            number(name, side as f64, "from 1 to a million", &|_| (1..=LONGEST_SIDE).contains(&side))?;
+            number(name, side as f64, "from 1 to a million", &|_| (1..=MAX_SIDE_PX).contains(&side))?;
         }
         let Ok(View { camera, from_world }) = &self.view else { return Ok(()) };
         if (camera.width, camera.height) != self.size {
@@ -252,7 +252,7 @@ impl Photograph {
         camera.validate().map_err(|source| RegistrationError::Camera { index, source })?;
         let side = width.max(height) as f64;
         for (name, focal) in [("fx", camera.fx), ("fy", camera.fy)] {
-            // 179° to 3 seconds of arc across.
+            // Fields of view of 179° to 3 arc seconds.
             number(name, focal, "from 0.005 to 100,000 times the longer side", &|f| {
                 f >= 0.005 * side && f <= 1e5 * side
             })?;
@@ -266,7 +266,7 @@ impl Photograph {
         let rotation = motion == CameraMotion::Rotation;
         let off = (from_world * from_world.transpose() - Matrix3::identity()).amax();
         let fits = if rotation {
-            off <= ROUNDING && from_world.determinant() > 0.0
+            off <= ORTHOGONALITY_TOLERANCE && from_world.determinant() > 0.0
         } else {
             let size = from_world.amax();
             size > 1e-9 && size < 1e9 && (from_world / size).determinant().abs() > 1e-12
@@ -279,14 +279,14 @@ impl Photograph {
     }
 }
 
-/// The registration as it is written.
+/// Serialized form of a registration.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RegistrationFile {
     schema: u32,
     /// A [`CameraMotion`] by its name: `rotation` or `plane`.
     mode: String,
-    /// Index of the photograph in the middle.
+    /// Index of the reference photograph.
     reference: usize,
     rms_px: f64,
     median_px: f64,
@@ -300,13 +300,13 @@ struct PhotographFile {
     name: String,
     width: usize,
     height: usize,
-    /// Missing where the photograph is not used.
+    /// Missing where the photograph is not registered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     camera: Option<CameraFile>,
     /// World rays to camera rays: the rows of a rotation, or of a homography where the mode is `plane`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     from_world: Option<[[f64; 3]; 3]>,
-    /// Why it is not used.
+    /// Why it is not registered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     left_out: Option<LeftOutFile>,
 }
@@ -390,7 +390,7 @@ impl TryFrom<RegistrationFile> for Registration {
         Self::check_schema(Some(file.schema.into()))?;
         let motion = match CameraMotion::from_name(&file.mode) {
             Ok(CameraMotion::Homography) => CameraMotion::Homography,
-            // What is no rotation is told of the matrices.
+            // Invalid rotations are reported for the matrices.
             _ => CameraMotion::Rotation,
         };
         let photograph = |(index, p): (usize, PhotographFile)| {

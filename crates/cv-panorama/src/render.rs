@@ -1,14 +1,16 @@
-//! From aligned photographs to the picture.
+//! Compositing: from aligned photographs to the panorama.
 
 use crate::align::Alignment;
+use crate::bit_depth::{Channel, EightBits, PhotoSample};
 use crate::blend::{BlendMode, Blender, Composition, NO_PHOTO, of_mode};
-use crate::depth::{Channel, EightBits, PhotoSample};
-use crate::light::{Exposure, ExposureCorrection, Gains, estimate_gains, fill_clipped, light_of, relative_to};
+use crate::photometric::{
+    Exposure, ExposureCorrection, Gains, decode_radiance, estimate_gains, fill_saturated, relative_gains,
+};
 use crate::rows::for_each_row;
 use crate::seams::{self, Seams, label_bounds};
 use crate::surface::{
     Bounds, Canvas, DisplacementField, Framing, Layout, LayoutError, PhotoMap, Placement, Preview, Projection,
-    WarpSettings, WarpedPhoto, displacements, largest_rectangle, layout, shrunk_view, warp,
+    WarpSettings, WarpedPhoto, displacements, downsampled_view, largest_rectangle, layout, warp,
 };
 use cv_core::{Cancelled, Image, ImageView, Mask, OptionError, Progress, RgbF32, Sample, Stage, StageClock};
 use cv_imgproc::{Interpolation, resize_area};
@@ -16,13 +18,13 @@ use cv_imgproc::{Interpolation, resize_area};
 /// Options of [`render`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CompositingOptions {
-    /// The surface. Default [`Projection::Auto`].
+    /// Projection. Default [`Projection::Auto`].
     pub projection: Projection,
-    /// Which part of the scene is drawn. Default all that the photographs show, as far as the surface draws it ([`Projection::widest_field`]).
+    /// Orientation and field of view. Default the extent of the photographs, at most [`Projection::widest_field`].
     pub framing: Framing,
-    /// Size of the panorama relative to the photographs: 1 draws the middle of a photograph of median focal length pixel for pixel. Above 0; default 1.
+    /// Resolution of the panorama relative to the photographs: at 1 the center of a photograph of median focal length keeps its scale. Above 0; default 1.
     pub resolution: f64,
-    /// Deform photographs slightly and smoothly so that they meet where the camera did not turn about its center. Default true.
+    /// Local alignment by smooth displacement fields, which compensates small parallax. Default true.
     pub elastic: bool,
     /// Exposure compensation. Default [`Exposure::Match`].
     pub exposure: Exposure,
@@ -30,13 +32,13 @@ pub struct CompositingOptions {
     pub seams: Seams,
     /// Blending. Default [`BlendMode::Multiband`].
     pub blend: BlendMode,
-    /// How values between pixels are found. Default bicubic: sharper than what other stitchers do, at a few milliseconds a megapixel.
+    /// Interpolation kernel. Default bicubic: a few milliseconds per megapixel more than bilinear, but sharper.
     pub interpolation: Interpolation,
-    /// Also draw the light of the scene ([`Panorama::radiance`]); what one photograph clips is then taken from one that does not, wherever there is one. Default false.
+    /// Also compute the linear radiance ([`Panorama::radiance`]), clipped pixels filled from photographs that are not clipped there. Default false.
     pub radiance: bool,
-    /// Cut the result to the largest upright rectangle without empty pixels. Default false.
+    /// Crop to the largest axis-aligned rectangle without empty pixels. Default false.
     pub crop: bool,
-    /// Most pixels of the canvas. Default 400 million, for which blending needs some 12 GB.
+    /// Maximum number of canvas pixels. Default 400 million, for which blending needs some 12 GB.
     pub max_pixels: usize,
 }
 
@@ -58,14 +60,14 @@ impl Default for CompositingOptions {
     }
 }
 
-/// Why a panorama could not be drawn.
+/// Why compositing failed.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum RenderError {
-    /// There is no canvas.
+    /// The canvas cannot be laid out.
     #[error(transparent)]
     Layout(#[from] LayoutError),
-    /// The photographs are not those that were aligned.
+    /// A photograph does not have the size that was aligned.
     #[error("photograph {index} is {width}x{height}; {expected_width}x{expected_height} was aligned")]
     WrongPhoto {
         /// Which.
@@ -79,12 +81,12 @@ pub enum RenderError {
         /// The height that was aligned.
         expected_height: usize,
     },
-    /// The blender gave a picture of another size than the canvas.
+    /// The blender returned an image of another size than the canvas.
     #[error("the blender gave {width}x{height} pixels for a canvas of {expected_width}x{expected_height}")]
     WrongBlend {
-        /// Width of the picture.
+        /// Width of the image.
         width: usize,
-        /// Height of the picture.
+        /// Height of the image.
         height: usize,
         /// Width of the canvas.
         expected_width: usize,
@@ -102,38 +104,37 @@ pub enum RenderError {
 /// A panorama.
 #[derive(Debug, Clone)]
 pub struct Panorama<T = u8> {
-    /// The picture, as deep as the photographs; black where no photograph reaches.
+    /// The image, of the bit depth of the photographs; black where no photograph covers it.
     pub image: Image<T, 3>,
-    /// The light of the scene where [`CompositingOptions::radiance`] asks for it: linear, not toned, in the primaries of the photographs; 1 is what the photograph that all others are aligned
-    /// to records as white at its middle, and brighter light is more. What every photograph that sees it clips is a lower bound. With [`Exposure::None`] each photograph is as it is. 0 where
-    /// no photograph reaches.
+    /// Linear scene radiance, if requested by [`CompositingOptions::radiance`]: not tone-mapped, in the primaries of the photographs; 1 is white at the center of the reference photograph.
+    /// Pixels clipped in every photograph are lower bounds. With [`Exposure::None`] each photograph keeps its exposure. 0 where no photograph covers it.
     pub radiance: Option<RgbF32>,
-    /// True where a photograph reaches.
+    /// True where a photograph covers the pixel.
     pub mask: Mask,
-    /// Which photograph each pixel is from; [`NO_PHOTO`] where none reaches.
+    /// Index of the photograph of each pixel; [`NO_PHOTO`] where none covers it.
     pub labels: Image<u16, 1>,
-    /// Where its pixels look.
+    /// Projection geometry.
     pub canvas: Canvas,
-    /// Where in its photograph each pixel comes from.
+    /// Map from its pixels to photograph pixels.
     pub map: PhotoMap,
-    /// True where the right edge continues at the left one.
+    /// Whether it spans 360°: the right edge continues at the left one.
     pub full_circle: bool,
-    /// True where photographs reach beyond what the surface draws at the most, and no field of view was asked for.
+    /// Whether photographs extend beyond the maximum field of view of the projection and none was requested.
     pub reaches_beyond: bool,
-    /// What the light of each photograph was multiplied with.
+    /// Photometric parameters.
     pub gains: Gains,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
 
-/// Pixels of the preview on which seams are found.
+/// Number of pixels of the preview on which seams are found.
 const PREVIEW_PIXELS: usize = 300_000;
 
-/// Draws the panorama.
+/// Composites the panorama.
 ///
-/// `photos` are those that were aligned, in the same order, in full size, of `u8` or `u16` samples: of these the panorama is. Where seams run, and how light differs, is found on 8 bits of them; `alignment` may have been made at another size and scaled.
-/// Costs O(canvas + pixels of the photographs), with the seams found on a preview of bounded size. Reports as the stages "elastic", "preview",
-/// "exposure", "seams", "warp", "seams" again, "blend" and "crop".
+/// `photos` are the aligned photographs, in the same order, at full size; the panorama has their sample type, `u8` or `u16`. Seams and exposure are estimated on 8 bits. The
+/// alignment may be that of resized photographs ([`Alignment::resized`]). O(canvas + pixels of the photographs); seams are found on a preview of bounded size first.
+/// Reports as the stages "elastic", "preview", "exposure", "seams", "warp", "seams" again, "blend" and "crop".
 ///
 /// # Errors
 /// [`RenderError`].
@@ -146,7 +147,7 @@ pub fn render<T: PhotoSample>(
     render_with(photos, alignment, options, options.blend.blender(), progress)
 }
 
-/// As [`render`], with a blender of the caller's instead of `options.blend`.
+/// As [`render`], with the caller's blender instead of `options.blend`.
 ///
 /// # Errors
 /// [`RenderError`].
@@ -160,7 +161,7 @@ pub fn render_with<T: PhotoSample>(
     T::draw(photos, alignment, options, blender, progress)
 }
 
-/// [`render_with`], compiled where it is called.
+/// Implements [`render_with`].
 pub(crate) fn draw<T: PhotoSample>(
     photos: &[ImageView<'_, T, 3>],
     alignment: &Alignment,
@@ -192,7 +193,7 @@ pub(crate) fn draw<T: PhotoSample>(
     clock.lap("seams");
 
     let typical_side = layout.typical_side();
-    // Deeper than any canvas, a pyramid has nothing to add.
+    // No canvas has more levels.
     let levels = blender.pyramid_levels(typical_side).min(16);
     let regions = regions(&coarse, preview.step, &layout, levels);
     let drawing = Drawing { photos, layout: &layout, regions: &regions, fields: &fields, options };
@@ -216,14 +217,14 @@ pub(crate) fn draw<T: PhotoSample>(
     clock.lap("blend");
     let radiance = if options.radiance {
         drop(warped);
-        let relative = relative_to(&gains, alignment.reference);
-        let light = drawing.light(&relative, progress)?;
-        let composition = Composition { photos: &light, labels: &labels, typical_side };
-        let mut light = of_mode::<f32>(options.blend).blend(&composition, progress)?;
-        // What bands and gradients overshoot.
-        light.as_mut_slice().iter_mut().for_each(|v| *v = v.max(0.0));
+        let relative = relative_gains(&gains, alignment.reference);
+        let radiance = drawing.radiance(&relative, progress)?;
+        let composition = Composition { photos: &radiance, labels: &labels, typical_side };
+        let mut radiance = of_mode::<f32>(options.blend).blend(&composition, progress)?;
+        // Blending may overshoot below zero.
+        radiance.as_mut_slice().iter_mut().for_each(|v| *v = v.max(0.0));
         clock.lap("radiance");
-        Some(light)
+        Some(radiance)
     } else {
         None
     };
@@ -257,7 +258,7 @@ pub(crate) fn draw<T: PhotoSample>(
     Ok(panorama)
 }
 
-/// Whether the photographs are those of the alignment, and the options numbers.
+/// Checks the sizes of the photographs and the options.
 fn check<T: Sample>(
     photos: &[ImageView<'_, T, 3>],
     alignment: &Alignment,
@@ -275,10 +276,10 @@ fn check<T: Sample>(
     Ok(())
 }
 
-/// The part of the canvas that each placement is drawn on: where the preview's labels name it, and the surroundings that a pyramid of so many levels needs.
+/// Returns the region of the canvas on which each placement is warped: the bounding box of its label, and the margin of a pyramid of `levels` levels.
 fn regions(coarse: &Image<u16, 1>, step: usize, layout: &Layout, levels: usize) -> Vec<Option<Bounds>> {
     let (w, h) = (layout.width, layout.height);
-    // A preview pixel for the label's own rounding, two for the refinement of the seam.
+    // One preview pixel for upsampling, two for the refinement of the seams.
     let slack = 3 * step;
     let region = |b: Bounds| {
         let full = Bounds {
@@ -292,7 +293,7 @@ fn regions(coarse: &Image<u16, 1>, step: usize, layout: &Layout, levels: usize) 
     label_bounds(coarse, layout.placements.len()).into_iter().map(|b| b.map(region)).collect()
 }
 
-/// What is drawn, and where.
+/// Inputs of warping.
 struct Drawing<'a, T> {
     photos: &'a [ImageView<'a, T, 3>],
     layout: &'a Layout,
@@ -302,12 +303,12 @@ struct Drawing<'a, T> {
 }
 
 impl<T: PhotoSample> Drawing<'_, T> {
-    /// A photograph drawn smaller is averaged first, over so many pixels, or fine texture would alias.
+    /// Returns the factor of the box filter that is applied before warping against aliasing.
     fn shrink(&self) -> usize {
         ((1.0 / self.options.resolution).floor() as usize).max(1)
     }
 
-    /// Every placement drawn on its region.
+    /// Warps every placement to its region.
     fn warped(&self, gains: &Gains, progress: &dyn Progress) -> Result<Vec<Option<WarpedPhoto<T>>>, Cancelled> {
         let stage = Stage::new(progress, "warp", self.layout.placements.len())?;
         let (shrink, tone) = (self.shrink(), gains.tone(T::PARTS));
@@ -324,15 +325,15 @@ impl<T: PhotoSample> Drawing<'_, T> {
         self.each(draw, &stage)
     }
 
-    /// The same as light, what is clipped filled from others.
-    fn light(&self, gains: &Gains, progress: &dyn Progress) -> Result<Vec<Option<WarpedPhoto<f32>>>, Cancelled> {
+    /// Warps the linear radiance of every placement to its region; clipped pixels are filled from the others.
+    fn radiance(&self, gains: &Gains, progress: &dyn Progress) -> Result<Vec<Option<WarpedPhoto<f32>>>, Cancelled> {
         let stage = Stage::new(progress, "radiance", self.layout.placements.len() + 1)?;
         let (shrink, tone) = (self.shrink(), gains.tone(1));
         let draw = |placement: &Placement, region: Bounds, field: Option<&DisplacementField>| {
-            let photo = light_of(self.photos[placement.photo], gains, &stage)?;
+            let photo = decode_radiance(self.photos[placement.photo], gains, &stage)?;
             let correction = Some(ExposureCorrection::new(&tone, gains, placement.photo));
             let size = ((photo.width() / shrink).max(1), (photo.height() / shrink).max(1));
-            // Blocks that are not whole are left out.
+            // Incomplete blocks are dropped.
             let whole =
                 photo.view().crop(0, 0, (size.0 * shrink).min(photo.width()), (size.1 * shrink).min(photo.height()));
             match whole.filter(|_| shrink > 1).and_then(|whole| resize_area(whole, size.0, size.1).ok()) {
@@ -341,12 +342,12 @@ impl<T: PhotoSample> Drawing<'_, T> {
             }
         };
         let mut drawn = self.each(draw, &stage)?;
-        fill_clipped(&mut drawn, &stage)?;
+        fill_saturated(&mut drawn, &stage)?;
         stage.add(1)?;
         Ok(drawn)
     }
 
-    /// What `draw` makes of every placement that has a region, one after the other.
+    /// Calls `draw` for every placement that has a region, one after the other.
     fn each<D>(
         &self,
         draw: impl Fn(&Placement, Bounds, Option<&DisplacementField>) -> Result<D, Cancelled>,
@@ -360,7 +361,7 @@ impl<T: PhotoSample> Drawing<'_, T> {
         Ok(drawn)
     }
 
-    /// A placement's photograph, which may have been shrunk, drawn on a region.
+    /// Warps the photograph of a placement, possibly downsampled, to a region.
     fn warp<D: Channel>(
         &self,
         photo: ImageView<'_, D, 3>,
@@ -375,14 +376,14 @@ impl<T: PhotoSample> Drawing<'_, T> {
             let settings = WarpSettings { displacement: field, interpolation, correction };
             return warp(photo, placement, &self.layout.surface, region, settings, stage);
         }
-        let placement = Placement { view: shrunk_view(placement, shrink, photo.size()), ..*placement };
+        let placement = Placement { view: downsampled_view(placement, shrink, photo.size()), ..*placement };
         let field = field.map(|f| f.scaled(1.0, 1.0 / shrink as f64));
         let settings = WarpSettings { displacement: field.as_ref(), interpolation, correction };
         warp(photo, &placement, &self.layout.surface, region, settings, stage)
     }
 }
 
-/// Cuts a panorama to the largest rectangle without empty pixels.
+/// Crops a panorama to the largest rectangle without empty pixels.
 fn crop<T: Sample>(p: &mut Panorama<T>, stage: &Stage<'_>) -> Result<(), Cancelled> {
     let Some(b) = largest_rectangle(p.mask.view(), stage)? else { return Ok(()) };
     let (w, h) = (b.width(), b.height());
@@ -390,7 +391,7 @@ fn crop<T: Sample>(p: &mut Panorama<T>, stage: &Stage<'_>) -> Result<(), Cancell
     if let Some(view) = p.image.view().crop(b.left, b.top, w, h) {
         p.image = view.to_image();
     }
-    if let Some(view) = p.radiance.as_ref().and_then(|light| light.view().crop(b.left, b.top, w, h)) {
+    if let Some(view) = p.radiance.as_ref().and_then(|radiance| radiance.view().crop(b.left, b.top, w, h)) {
         p.radiance = Some(view.to_image());
     }
     if let Some(view) = p.labels.view().crop(b.left, b.top, w, h) {
@@ -715,7 +716,7 @@ mod tests {
     }
 
     #[test]
-    fn the_light_is_that_of_the_scene_where_one_photograph_did_not_clip_it() {
+    fn radiance_is_exact_where_a_photograph_is_not_clipped() {
         let set = Set::three();
         // Light from a 30th to four times white, in waves of 100 px, as the middle one sees it; the outer two have a fifth of the exposure, and sRGB's curve (IEC 61966-2-1).
         let light = |ray: &Vector3<f64>| {

@@ -1,14 +1,14 @@
-//! Work on the rows of an image, in parallel, that can be stopped.
+//! Parallel, cancellable iteration over image rows.
 
 use cv_core::{Cancelled, Stage};
 use rayon::prelude::*;
 
-/// Samples between two questions whether to go on: a few milliseconds of the slowest work done here.
-const SAMPLES: usize = 1 << 18;
+/// Samples processed between two checks for cancellation: a few milliseconds of the slowest loops.
+const SAMPLES_PER_CHECK: usize = 1 << 18;
 
-/// Whether to ask before row `y`, of `width` samples.
-pub(crate) fn asks(y: usize, width: usize) -> bool {
-    y.is_multiple_of((SAMPLES / width.max(1)).max(1))
+/// Returns whether to check for cancellation before row `y` of `width` samples.
+pub(crate) fn is_check_due(y: usize, width: usize) -> bool {
+    y.is_multiple_of((SAMPLES_PER_CHECK / width.max(1)).max(1))
 }
 
 /// Calls `work` with the index and the samples of every row of `data`, in parallel.
@@ -24,7 +24,7 @@ pub(crate) fn for_each_row<T: Send>(
     for_each_row_with(data, width, stage, || (), |(), y, row| work(y, row))
 }
 
-/// As [`for_each_row`], with a buffer for each run of rows that one thread works on.
+/// As [`for_each_row`], with a scratch buffer per run of rows of one thread.
 ///
 /// # Errors
 /// [`Cancelled`]; rows may then be missing.
@@ -36,7 +36,7 @@ pub(crate) fn for_each_row_with<T: Send, B>(
     work: impl Fn(&mut B, usize, &mut [T]) + Sync,
 ) -> Result<(), Cancelled> {
     data.par_chunks_mut(width.max(1)).enumerate().try_for_each_init(&buffer, |buffer, (y, row)| {
-        if asks(y, width) {
+        if is_check_due(y, width) {
             stage.check()?;
         }
         work(buffer, y, row);
@@ -60,7 +60,7 @@ mod tests {
     }
 
     #[test]
-    fn no_more_than_a_quarter_of_a_million_samples_lie_between_two_questions() {
+    fn checks_are_at_most_a_quarter_of_a_million_samples_apart() {
         let (width, height) = (1000, 2000);
         let progress = StopAt::never();
         let stage = Stage::new(&progress, "rows", 1).unwrap();
@@ -68,11 +68,11 @@ mod tests {
         // One for the beginning of the stage.
         assert_eq!(progress.reports(), 1 + (height as f64 / 262.0).ceil() as usize);
         // A row longer than that is asked about by itself.
-        assert!((0..5).all(|y| asks(y, 1 << 20)));
+        assert!((0..5).all(|y| is_check_due(y, 1 << 20)));
     }
 
     #[test]
-    fn the_answer_to_stop_ends_the_work() {
+    fn cancellation_ends_the_work() {
         let progress = StopAt::report(3);
         let stage = Stage::new(&progress, "rows", 1).unwrap();
         let result = for_each_row(&mut vec![0_u8; 4_000_000], 1000, &stage, |_, _| {});

@@ -1,11 +1,11 @@
-//! What the tests of several rooms need: photographs of a scene at infinity, and a progress that stops.
+//! Test utilities: photographs of a scene at infinity, and a progress callback that cancels.
 
 use crate::align::View;
 use crate::surface::{Bounds, WarpedPhoto};
 use cv_core::{Cancelled, Image, Point2, Progress, RgbU8, Stage, Vector3};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Counts the reports and stops at one of them.
+/// Counts reports and cancels at one of them.
 pub(crate) struct StopAt {
     at: usize,
     stage: Option<&'static str>,
@@ -17,7 +17,7 @@ impl StopAt {
         Self::report(usize::MAX)
     }
 
-    /// Stops at the report of this number, counted from 1, and at all after it.
+    /// Cancels at the report of this number, counted from 1, and at all later ones.
     pub(crate) fn report(at: usize) -> Self {
         Self { at, stage: None, reports: AtomicUsize::new(0) }
     }
@@ -40,19 +40,19 @@ impl Progress for StopAt {
     }
 }
 
-/// A stage that nobody stops.
+/// A stage that is never cancelled.
 pub(crate) fn stage() -> Stage<'static> {
     Stage::new(&cv_core::Silent, "test", 1).unwrap()
 }
 
-/// The color of a smooth scene at infinity in a direction: waves a tenth of a radian long and longer.
+/// Color of a smooth scene at infinity: waves of a tenth of a radian and longer.
 pub(crate) fn sky(ray: &Vector3<f64>) -> [f64; 3] {
     let r = ray.normalize();
     let wave = |a: f64, b: f64, c: f64| (60.0 * r.x * a + 0.7).sin() * (60.0 * r.y * b).cos() + (20.0 * r.z * c).sin();
     [120.0 + 45.0 * wave(1.0, 0.8, 0.5), 120.0 + 45.0 * wave(0.6, 1.1, 0.3), 110.0 + 40.0 * wave(0.9, 0.5, 0.9)]
 }
 
-/// What a camera sees of a scene at infinity.
+/// Renders a scene at infinity.
 pub(crate) fn photograph(view: &View, scene: impl Fn(&Vector3<f64>) -> [f64; 3]) -> RgbU8 {
     RgbU8::from_fn(view.camera.width, view.camera.height, |x, y| {
         let ray = view.ray(Point2::new(x as f64, y as f64)).unwrap();

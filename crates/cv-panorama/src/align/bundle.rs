@@ -1,9 +1,9 @@
-//! Global refinement of all photographs over all overlaps at once (Brown & Lowe 2007, §4).
+//! Bundle adjustment of all photographs over all overlaps (Brown & Lowe 2007, §4).
 //!
-//! One problem serves both kinds of set. Photograph `i` sees the world through a 3×3 matrix `M_i` (a rotation, or a homography
-//! where the scene is flat) and a lens (focal length, one radial coefficient). A match `a ↔ b` of photographs `i` and `j` is
-//! carried from `i` to `j` by `M_j M_i⁻¹` and compared in pixels, and the other way round. `M` moves by
-//! `M ← (I + Σ δ_k G_k) M`: the `G_k` are the three generators of rotations, or eight of homographies.
+//! Photograph `i` has a 3×3 matrix `M_i` (world to camera: a rotation, or a homography of a planar scene) and intrinsics (focal length, one
+//! radial distortion coefficient). A match `a ↔ b` of photographs `i` and `j` is transferred from `i` to `j` by `M_j M_i⁻¹` and back; the
+//! residuals are the symmetric transfer errors in pixels. Updates are `M ← (I + Σ δ_k G_k) M` with the three generators `G_k` of rotations,
+//! or eight of homographies.
 
 use cv_core::{Distortion, Point2};
 use cv_numeric::RobustLoss;
@@ -14,16 +14,16 @@ use cv_numeric::adjust::{
 use nalgebra::{Matrix3, SMatrix, Vector2, Vector3};
 use std::ops::ControlFlow;
 
-/// What a photograph's matrix may be.
+/// The motion model of a photograph.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Motion {
-    /// The camera turned about its center.
+    /// Rotation about the camera center.
     Rotation,
-    /// The scene is flat, the camera moved.
+    /// Planar scene, arbitrary camera motion.
     Homography,
 }
 
-/// Homographies up to scale: nine numbers by columns, eight degrees of freedom, all entries of the factor but the last.
+/// Homographies up to scale: nine entries in column-major order, eight degrees of freedom (all entries of the update but the last).
 struct HomographyManifold;
 
 impl Manifold for HomographyManifold {
@@ -42,7 +42,7 @@ impl Manifold for HomographyManifold {
     }
 }
 
-/// Matches of two photographs, in pixels from their principal points.
+/// Matches of two photographs, in pixels relative to their principal points.
 #[derive(Debug, Clone)]
 pub(crate) struct Overlap {
     pub(crate) i: usize,
@@ -50,7 +50,7 @@ pub(crate) struct Overlap {
     pub(crate) points: Vec<(Vector2<f64>, Vector2<f64>)>,
 }
 
-/// One lens, shared by the photographs that name it.
+/// Intrinsics shared by a group of photographs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Lens {
     pub(crate) log_focal: f64,
@@ -63,7 +63,7 @@ impl Lens {
         Distortion::simple_radial(self.k1)
     }
 
-    /// The ray of a pixel, `None` out of the lens's reach.
+    /// Undistorts a pixel to normalized coordinates; `None` outside the range of the distortion model.
     fn ray(&self, pixel: Vector2<f64>) -> Option<Point2<f64>> {
         let q = Point2::from(pixel / self.log_focal.exp());
         let p = if self.k1 == 0.0 { q } else { self.distortion().undistort(q) };
@@ -71,7 +71,7 @@ impl Lens {
     }
 }
 
-/// All unknowns.
+/// All parameters of the adjustment.
 #[derive(Debug, Clone)]
 pub(crate) struct State {
     /// World to camera, per photograph.
@@ -79,28 +79,28 @@ pub(crate) struct State {
     pub(crate) lenses: Vec<Lens>,
 }
 
-/// Which unknowns move, and what is known beforehand.
+/// Which parameters are free, and their priors.
 #[derive(Debug, Clone)]
 pub(crate) struct Problem<'a> {
     pub(crate) kind: Motion,
     pub(crate) overlaps: &'a [Overlap],
-    /// Lens of each photograph.
+    /// Index of the intrinsics of each photograph.
     pub(crate) lens_of: &'a [usize],
-    /// The photograph that stays where it is.
+    /// The photograph whose rotation is fixed (gauge).
     pub(crate) fixed: usize,
     pub(crate) free_focal: bool,
     pub(crate) free_k1: bool,
-    /// Expected logarithm of each lens's focal length and its standard deviation.
+    /// Prior of each log focal length: mean and standard deviation.
     pub(crate) focal_prior: &'a [(f64, f64)],
     pub(crate) loss: RobustLoss,
 }
 
-/// Standard deviation of k1 beforehand: ordinary lenses reach ±0.2 in these units, phone cameras, which correct themselves, ±0.03.
+/// Prior standard deviation of k1: ordinary lenses reach ±0.2, phone cameras with built-in correction ±0.03.
 const K1_SIGMA: f64 = 0.1;
-/// Residual in pixels that stands for a point behind the camera or out of the lens's reach.
-const LOST: f64 = 1e4;
+/// Residual, in pixels, of a point behind the camera or outside the range of the distortion model.
+const INVALID_RESIDUAL_PX: f64 = 1e4;
 
-/// Matches carried from one photograph to another: motions of `M` degrees of freedom of the source and the target, and their lenses.
+/// Transfer errors of matches: parameters are the motions of source and target (`M` degrees of freedom each) and their intrinsics.
 struct Transfers<const M: usize, const C: usize> {
     kind: Motion,
     generators: [Matrix3<f64>; M],
@@ -120,12 +120,12 @@ impl<const M: usize, const C: usize> Residual<2, 4, C> for Transfers<M, C> {
         let (a, b) = self.matches[item];
         let [from, to] = [from, to].map(|l| Lens { log_focal: l[0], k1: l[1] });
         let relative = Matrix3::from_column_slice(target) * inverse(self.kind, &Matrix3::from_column_slice(source));
-        let lost = Some(Vector2::new(LOST, 0.0));
-        let Some(p) = from.ray(a) else { return lost };
+        let invalid = Some(Vector2::new(INVALID_RESIDUAL_PX, 0.0));
+        let Some(p) = from.ray(a) else { return invalid };
         let x = p.to_homogeneous();
         let y = relative * x;
-        let Some(seen) = see(&y, to) else { return lost };
-        let Some(j) = jacobian else { return Some(seen - b) };
+        let Some(projected) = project(&y, to) else { return invalid };
+        let Some(j) = jacobian else { return Some(projected - b) };
         let n = Point2::new(y.x / y.z, y.y / y.z);
         let f = to.log_focal.exp();
         let (_, by_n, by_lens) = to.distortion().distort_with_jacobians(n);
@@ -135,18 +135,18 @@ impl<const M: usize, const C: usize> Residual<2, 4, C> for Transfers<M, C> {
             j.set_column(M + k, &by_y(g * y));
         }
         let (q, by_p, by_k1) = from.distortion().distort_with_jacobians(p);
-        let Some(inverse_lens) = by_p.try_inverse() else { return lost };
+        let Some(inverse_lens) = by_p.try_inverse() else { return invalid };
         let by_ray = |dp: Vector2<f64>| by_y(relative * Vector3::new(dp.x, dp.y, 0.0));
         j.set_column(2 * M, &by_ray(-(inverse_lens * q.coords)));
         j.set_column(2 * M + 1, &by_ray(-(inverse_lens * by_k1.column(0))));
-        j.set_column(2 * M + 2, &seen);
+        j.set_column(2 * M + 2, &projected);
         j.set_column(2 * M + 3, &(by_lens.column(0) * f));
-        Some(seen - b)
+        Some(projected - b)
     }
 }
 
-/// Where a ray is seen, from the principal point; `None` behind the camera, and beyond the turning point of the lens, where a pixel means nothing.
-fn see(y: &Vector3<f64>, lens: Lens) -> Option<Vector2<f64>> {
+/// Projects a ray to pixels relative to the principal point; `None` behind the camera and outside the monotonic range of the distortion.
+fn project(y: &Vector3<f64>, lens: Lens) -> Option<Vector2<f64>> {
     if y.z <= 1e-6 * y.norm() {
         return None;
     }
@@ -165,7 +165,7 @@ fn generators_of_rotations() -> [Matrix3<f64>; 3] {
     std::array::from_fn(|k| Vector3::ith(k, 1.0).cross_matrix())
 }
 
-/// All entries but the last: the scale of a homography means nothing.
+/// All entries but the last: homographies are defined up to scale.
 fn generators_of_homographies() -> [Matrix3<f64>; 8] {
     std::array::from_fn(|k| {
         let mut g = Matrix3::zeros();
@@ -175,13 +175,13 @@ fn generators_of_homographies() -> [Matrix3<f64>; 8] {
 }
 
 impl Problem<'_> {
-    /// Pixels of photograph `i` (from its principal point) to those of `j`.
+    /// Transfers a pixel of photograph `i` to photograph `j`, both relative to the principal points.
     pub(crate) fn transfer(&self, s: &State, i: usize, j: usize, a: Vector2<f64>) -> Option<Vector2<f64>> {
         let (from, to) = (s.lenses[self.lens_of[i]], s.lenses[self.lens_of[j]]);
-        see(&(s.motion[j] * inverse(self.kind, &s.motion[i]) * from.ray(a)?.to_homogeneous()), to)
+        project(&(s.motion[j] * inverse(self.kind, &s.motion[i]) * from.ray(a)?.to_homogeneous()), to)
     }
 
-    /// Minimizes the reprojection error from `start`. A start that is not finite is returned with an infinite cost.
+    /// Minimizes the transfer errors from `start`; returns the state and its cost. A start that is not finite is returned with infinite cost.
     pub(crate) fn solve(&self, start: State, max_iterations: usize) -> (State, f64) {
         let mut state = start.clone();
         match self.adjust(&mut state, max_iterations) {
@@ -209,18 +209,18 @@ impl Problem<'_> {
         };
         problem.fix(motions, self.fixed)?;
         for lens in 0..state.lenses.len() {
-            let held: Vec<usize> = [(0, self.free_focal), (1, self.free_k1)]
+            let fixed: Vec<usize> = [(0, self.free_focal), (1, self.free_k1)]
                 .into_iter()
                 .filter(|(_, free)| !free)
                 .map(|(k, _)| k)
                 .collect();
-            problem.fix_parameters(lenses, lens, &held)?;
+            problem.fix_parameters(lenses, lens, &fixed)?;
         }
         let weight = |free: bool, sigma: f64| if free { 1.0 / sigma } else { 0.0 };
-        let known = |&(mean, sigma): &(f64, f64)| {
+        let prior_item = |&(mean, sigma): &(f64, f64)| {
             ([mean, 0.0], [weight(self.free_focal, sigma), weight(self.free_k1, K1_SIGMA)])
         };
-        let prior = Prior { items: self.focal_prior.iter().map(known).collect() };
+        let prior = Prior { items: self.focal_prior.iter().map(prior_item).collect() };
         let blocks = (0..self.focal_prior.len() as u32).map(|l| [l]).collect();
         problem.add_residuals("lens priors", prior, [lenses], blocks, RobustLoss::Trivial)?;
         let options = AdjustOptions { max_iterations, cost_tolerance: 1e-7, ..AdjustOptions::default() };
@@ -234,7 +234,7 @@ impl Problem<'_> {
         Ok(report)
     }
 
-    /// Every match in both directions.
+    /// Adds the residuals of every match in both directions.
     fn add_matches<const M: usize, const C: usize>(
         &self,
         problem: &mut Adjustment<'_>,
@@ -254,9 +254,11 @@ impl Problem<'_> {
         problem.add_residuals("matches", transfers, [motions, motions, lenses, lenses], blocks, self.loss)
     }
 
-    /// Squared error in pixels of every match of an overlap, the mean of the two directions.
+    /// Computes the squared transfer error of every match of an overlap in pixels², the mean of both directions.
     pub(crate) fn squared_errors(&self, s: &State, o: &Overlap) -> Vec<f64> {
-        let one = |i, j, a, b: Vector2<f64>| self.transfer(s, i, j, a).map_or(LOST * LOST, |p| (p - b).norm_squared());
+        let one = |i, j, a, b: Vector2<f64>| {
+            self.transfer(s, i, j, a).map_or(INVALID_RESIDUAL_PX * INVALID_RESIDUAL_PX, |p| (p - b).norm_squared())
+        };
         o.points.iter().map(|&(a, b)| 0.5 * (one(o.i, o.j, a, b) + one(o.j, o.i, b, a))).collect()
     }
 }
@@ -266,9 +268,9 @@ mod tests {
     use super::*;
     use nalgebra::Rotation3;
 
-    /// Points that two cameras turned by `angles` see, the lens `focal`, `k1`.
+    /// Matches of exact points between rotated cameras of focal length `focal` and distortion `k1`.
     fn overlaps(rotations: &[Rotation3<f64>], focal: f64, k1: f64) -> Vec<Overlap> {
-        let see = |r: &Rotation3<f64>, ray: Vector3<f64>| -> Option<Vector2<f64>> {
+        let project = |r: &Rotation3<f64>, ray: Vector3<f64>| -> Option<Vector2<f64>> {
             let c = r * ray;
             let n = Vector2::new(c.x / c.z, c.y / c.z);
             let p = n * (focal * (1.0 + k1 * n.norm_squared()));
@@ -281,7 +283,7 @@ mod tests {
                 for u in -30..=30 {
                     for v in -8..=8 {
                         let ray = Vector3::new(f64::from(u) * 0.06, f64::from(v) * 0.06, 1.0);
-                        if let (Some(a), Some(b)) = (see(&rotations[i], ray), see(&rotations[j], ray)) {
+                        if let (Some(a), Some(b)) = (project(&rotations[i], ray), project(&rotations[j], ray)) {
                             points.push((a, b));
                         }
                     }

@@ -1,19 +1,19 @@
-//! Focal length from the homography between two views of a camera that turned (Szeliski & Shum 1997).
+//! Focal lengths from the homography between two views of a rotating camera (Szeliski & Shum 1997).
 
 use nalgebra::Matrix3;
 
-/// The focal lengths `(fa, fb)` in pixels for which `h` (pixels of a to pixels of b, both from their principal points) is
-/// `K_b R K_a⁻¹`; each `None` where the homography does not tell.
+/// Estimates the focal lengths `(fa, fb)`, in pixels, for which `h` (pixels of a to pixels of b, both relative to their principal
+/// points) is `K_b R K_a⁻¹`; each is `None` where the homography does not determine it.
 ///
-/// The columns of R are orthogonal and of one length, which gives two equations in `1/fb²`, and the rows likewise in `fa²`; each pair
-/// is solved by least squares and believed where its two equations agree.
+/// The columns of R are orthogonal and of equal length: two equations in `1/fb²`; its rows give two in `fa²`. Each pair is solved by
+/// least squares and accepted where the two equations are consistent.
 pub(crate) fn focals_from_homography(h: &Matrix3<f64>) -> (Option<f64>, Option<f64>) {
     // fb² · B + A = 0, with A from the upper two entries and B from the last of the first two columns.
     let solve = |a: [f64; 2], b: [f64; 2]| -> Option<f64> {
         let (dot, aa, bb) = (a[0] * b[0] + a[1] * b[1], a[0] * a[0] + a[1] * a[1], b[0] * b[0] + b[1] * b[1]);
-        // The two equations differ by up to 60°: of parallax and noise more than of rotation.
-        let believed = -dot > 0.5 * (aa * bb).sqrt() && bb > 0.0;
-        Some((-dot / bb).sqrt()).filter(|f| believed && f.is_finite())
+        // Beyond 60° between the two equations, parallax and noise dominate.
+        let is_consistent = -dot > 0.5 * (aa * bb).sqrt() && bb > 0.0;
+        Some((-dot / bb).sqrt()).filter(|f| is_consistent && f.is_finite())
     };
     let columns = |m: &Matrix3<f64>| {
         let a = [
@@ -23,7 +23,7 @@ pub(crate) fn focals_from_homography(h: &Matrix3<f64>) -> (Option<f64>, Option<f
         let b = [2.0 * m[(2, 0)] * m[(2, 1)], m[(2, 0)].powi(2) - m[(2, 1)].powi(2)];
         solve(a, b)
     };
-    // The inverse homography exchanges the photographs.
+    // The inverse homography swaps the two images.
     (h.try_inverse().and_then(|inverse| columns(&inverse)), columns(h))
 }
 
@@ -48,7 +48,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_tell_the_focal_length_is_not_believed() {
+    fn undetermined_focal_lengths_are_none() {
         assert_eq!(focals_from_homography(&Matrix3::identity()), (None, None));
         // A shift and a turn about the optical axis: no perspective.
         let flat = Matrix3::new(0.8, -0.6, 40.0, 0.6, 0.8, -7.0, 0.0, 0.0, 1.0);

@@ -1,4 +1,4 @@
-//! One connected component of the match graph: cameras from a spanning tree, then all at once over all overlaps.
+//! Alignment of one connected component of the match graph: initialization along a spanning tree, then bundle adjustment over all overlaps.
 
 use crate::align::bundle::{Lens, Motion, Overlap, Problem, State};
 use crate::align::focal::focals_from_homography;
@@ -10,7 +10,7 @@ use cv_geometry::{PairEdge, PairGraph, VerifiedPair};
 use cv_numeric::{RobustLoss, svd3};
 use nalgebra::{Matrix3, Vector2};
 
-/// The connected photographs to be placed, under indices of their own.
+/// A connected component of the match graph; its photographs are indexed from 0.
 pub(crate) struct Group<'a> {
     /// Photograph of each member.
     members: Vec<usize>,
@@ -24,20 +24,20 @@ pub(crate) struct Group<'a> {
     components: Vec<Vec<usize>>,
 }
 
-/// Matches of an overlap that a first solution is found from, which all of them refine: thirty times the three unknowns of a turn.
-const FEW: usize = 100;
+/// Maximum number of matches per overlap in the initial adjustment: thirty times the three unknowns of a rotation.
+const MAX_INITIAL_MATCHES: usize = 100;
 
-/// Difference of the logarithms of focal lengths from which on a lens was zoomed between photographs: focusing nearer changes them by less.
-const ZOOMED: f64 = 0.03;
+/// Minimum spread of log focal lengths at which photographs get separate focal lengths (zoom); refocusing changes them by less.
+const MIN_ZOOM_LOG_SPREAD: f64 = 0.03;
 
-/// The rotation nearest to a matrix; the identity where the matrix tells none. (nalgebra's own search for it does not end where the distance to the matrix stays
-/// the same about an axis, as with those of rank one that focal lengths far from the truth make.)
+/// Returns the nearest rotation (Frobenius norm); the identity where it is undefined. (nalgebra's iteration does not terminate for matrices of rank one,
+/// which focal lengths far from the truth produce.)
 fn nearest_rotation(m: &Matrix3<f64>) -> Matrix3<f64> {
     let nearest = svd3(m).map(|svd| svd.nearest_rotation().into_inner());
     nearest.ok().filter(|r| r.iter().all(|v| v.is_finite())).unwrap_or_else(Matrix3::identity)
 }
 
-/// Pixel center of a photograph's middle, or its camera's principal point.
+/// Returns the principal point: that of the camera, or the image center.
 fn center(p: &Photo) -> Vector2<f64> {
     match p.camera {
         Some(c) => Vector2::new(c.cx, c.cy),
@@ -45,8 +45,8 @@ fn center(p: &Photo) -> Vector2<f64> {
     }
 }
 
-/// A pixel of the photograph as an ideal camera with square pixels of width fx would have it, from the principal point.
-fn ideal(p: &Photo, pixel: Point2<f64>) -> Vector2<f64> {
+/// Returns a pixel relative to the principal point, undistorted and with square pixels of focal length fx where the camera is calibrated.
+fn undistorted(p: &Photo, pixel: Point2<f64>) -> Vector2<f64> {
     match p.camera {
         Some(c) => c.normalize(pixel).coords * c.fx,
         None => pixel.coords - center(p),
@@ -72,7 +72,7 @@ impl<'a> Group<'a> {
             let points = pair
                 .matches
                 .iter()
-                .map(|c| (ideal(&photos[pair.a], c.a), ideal(&photos[pair.b], c.b)))
+                .map(|c| (undistorted(&photos[pair.a], c.a), undistorted(&photos[pair.b], c.b)))
                 .filter(|(a, b)| a.iter().chain(b.iter()).all(|v| v.is_finite()))
                 .collect();
             kept.push(*pair);
@@ -86,22 +86,22 @@ impl<'a> Group<'a> {
         Ok(Self { members, photos, pairs: kept, overlaps, graph, tree, reference, components })
     }
 
-    /// Photographs to lenses, and a representative photograph of each lens.
+    /// Groups photographs by shared intrinsics: the group of each photograph, and a representative photograph of each group.
     fn lenses(&self) -> (Vec<usize>, Vec<usize>) {
-        let mut heads: Vec<usize> = Vec::new();
+        let mut representatives: Vec<usize> = Vec::new();
         let of = (0..self.photos.len())
-            .map(|i| match heads.iter().position(|&h| self.photos[h].shares_lens(&self.photos[i])) {
+            .map(|i| match representatives.iter().position(|&h| self.photos[h].shares_lens(&self.photos[i])) {
                 Some(lens) => lens,
                 None => {
-                    heads.push(i);
-                    heads.len() - 1
+                    representatives.push(i);
+                    representatives.len() - 1
                 }
             })
             .collect();
-        (of, heads)
+        (of, representatives)
     }
 
-    /// The homography of an edge from member `from`, in centered pixels.
+    /// Returns the homography of an edge from member `from`, in pixels relative to the principal points.
     fn homography(&self, edge: usize, from: usize) -> Matrix3<f64> {
         let (pair, e) = (self.pairs[edge], self.graph.edges()[edge]);
         let shift = |v: Vector2<f64>| Matrix3::new(1.0, 0.0, v.x, 0.0, 1.0, v.y, 0.0, 0.0, 1.0);
@@ -109,9 +109,9 @@ impl<'a> Group<'a> {
         if from == e.a { h } else { h.try_inverse().unwrap_or_else(Matrix3::identity) }
     }
 
-    /// First guess of each lens's focal length with the standard deviation of its logarithm.
-    fn focal_guesses(&self, heads: &[usize]) -> Vec<(f64, f64)> {
-        // Focal lengths over long sides, so that photographs of other sizes can lend theirs.
+    /// Returns the prior of each group's log focal length: mean and standard deviation.
+    fn focal_guesses(&self, representatives: &[usize]) -> Vec<(f64, f64)> {
+        // Focal lengths relative to the longer side, comparable between image sizes.
         let mut estimates: Vec<f64> = Vec::new();
         for (edge, &PairEdge { a, b, .. }) in self.graph.edges().iter().enumerate() {
             let (fa, fb) = focals_from_homography(&self.homography(edge, a));
@@ -121,21 +121,21 @@ impl<'a> Group<'a> {
         // 0.25 is a lens of 127° across, 20 one of 3°.
         estimates.retain(|ratio| (0.25..20.0).contains(ratio));
         estimates.sort_by(f64::total_cmp);
-        // Without any estimate: 53° across, a usual wide lens.
+        // Without an estimate: a field of view of 53°, a common wide-angle lens.
         let ratio = estimates.get(estimates.len() / 2).copied().unwrap_or(1.0);
-        heads
+        representatives
             .iter()
             .map(|&h| match (self.photos[h].camera, self.photos[h].focal) {
-                // Calibrated: not to be moved.
+                // Calibrated: fixed.
                 (Some(camera), _) => (camera.fx.ln(), 1e-6),
-                // EXIF is right to a few percent, unless the photograph was cropped.
+                // EXIF is accurate to a few percent unless the photograph was cropped.
                 (None, Some(focal)) if focal.is_finite() && focal > 0.0 => (focal.ln(), 0.2),
                 _ => ((ratio * self.photos[h].long_side()).ln(), 0.7),
             })
             .collect()
     }
 
-    /// Motions composed along the spanning tree.
+    /// Chains relative motions along the spanning tree.
     fn compose(&self, kind: Motion, lens_of: &[usize], lenses: &[Lens]) -> Vec<Matrix3<f64>> {
         let mut motion = vec![Matrix3::identity(); self.photos.len()];
         let focal = |i: usize| lenses[lens_of[i]].log_focal.exp();
@@ -167,13 +167,13 @@ impl<'a> Group<'a> {
         }
     }
 
-    /// Of each overlap as many matches as a first solution needs, evenly chosen.
-    fn few_matches(&self) -> Vec<Overlap> {
-        let few = |o: &Overlap| {
-            let step = o.points.len().div_ceil(FEW).max(1);
+    /// Subsamples the matches of each overlap uniformly for the initial adjustment.
+    fn subsampled_overlaps(&self) -> Vec<Overlap> {
+        let subsample = |o: &Overlap| {
+            let step = o.points.len().div_ceil(MAX_INITIAL_MATCHES).max(1);
             Overlap { points: o.points.iter().copied().step_by(step).collect(), ..*o }
         };
-        self.overlaps.iter().map(few).collect()
+        self.overlaps.iter().map(subsample).collect()
     }
 
     pub(crate) fn solve(
@@ -186,12 +186,12 @@ impl<'a> Group<'a> {
         Ok(match (options.motion, rotation.transpose()?) {
             (CameraMotion::Auto, Some(rotation)) => {
                 let typical = self.median_error(Motion::Rotation, &rotation);
-                // Matches fit a turn to the σ of the loss: no need to look for another explanation.
+                // The rotation model fits to within the σ of the loss: the homography model is not tried.
                 if typical <= 0.75 * options.outlier_px {
                     return Ok((rotation, CameraMotion::Rotation));
                 }
                 let flat = flat()?;
-                // Five more unknowns per photograph always fit better: only a far better fit means a flat scene.
+                // Model selection: the homography model has five more unknowns per photograph and must fit far better.
                 let better = self.median_error(Motion::Homography, &flat) < 0.4 * typical;
                 if better && self.in_front(&flat) {
                     (flat, CameraMotion::Homography)
@@ -204,19 +204,20 @@ impl<'a> Group<'a> {
         })
     }
 
-    /// Turning cameras: shared lenses first, from several focal lengths where none is known, then what the matches ask for.
+    /// Solves the rotation model: shared intrinsics first, from several initial focal lengths where none is known; then distortion and separate focal
+    /// lengths where they reduce the cost significantly.
     fn solve_rotation(&self, options: &AlignOptions, stage: &Stage<'_>) -> Result<Solution, Cancelled> {
-        let (lens_of, heads) = self.lenses();
-        let prior = self.focal_guesses(&heads);
-        let known = heads.iter().all(|&h| self.photos[h].camera.is_some() || self.photos[h].focal.is_some());
+        let (lens_of, representatives) = self.lenses();
+        let prior = self.focal_guesses(&representatives);
+        let known = representatives.iter().all(|&h| self.photos[h].camera.is_some() || self.photos[h].focal.is_some());
         let factors: &[f64] = if known { &[1.0] } else { &[1.0, 0.6, 1.7, 3.0] };
-        let few = self.few_matches();
+        let few = self.subsampled_overlaps();
         let wide =
             Problem { overlaps: &few, ..self.problem(Motion::Rotation, &lens_of, &prior, 10.0 * options.outlier_px) };
         let start = |factor: &f64| {
             let lenses: Vec<Lens> = prior
                 .iter()
-                .zip(&heads)
+                .zip(&representatives)
                 .map(|(p, &h)| {
                     let free = self.photos[h].camera.is_none() && self.photos[h].focal.is_none();
                     Lens { log_focal: p.0 + if free { factor.ln() } else { 0.0 }, k1: 0.0 }
@@ -233,30 +234,30 @@ impl<'a> Group<'a> {
         stage.check()?;
         let mut problem = self.problem(Motion::Rotation, &lens_of, &prior, options.outlier_px);
         let (mut state, mut cost) = problem.solve(state, 50);
-        // A coefficient earns its place by a twentieth of the cost: less is what parallax gives to any new unknown.
-        let earns = |new: f64, old: f64| new < 0.95 * old - 20.0 * options.outlier_px.powi(2);
+        // Model selection: an unknown must reduce the cost by 5 %; parallax alone gives less.
+        let is_significant = |new: f64, old: f64| new < 0.95 * old - 20.0 * options.outlier_px.powi(2);
         let calibrated = self.photos.iter().any(|p| p.camera.is_some());
         if options.refine_distortion && !calibrated {
             stage.check()?;
             let radial = Problem { free_k1: true, ..problem.clone() };
             let (with, new) = radial.solve(state.clone(), 50);
-            if earns(new, cost) {
+            if is_significant(new, cost) {
                 (state, cost) = (with, new);
                 problem = radial;
             }
         }
-        if !calibrated && lens_of.len() > heads.len() {
+        if !calibrated && lens_of.len() > representatives.len() {
             stage.check()?;
             let own: Vec<usize> = (0..lens_of.len()).collect();
-            // Zoomed between photographs: each has a focal length of its own, near the common one.
+            // Zoom between photographs: separate focal lengths with the common one as prior mean.
             let own_prior: Vec<(f64, f64)> = lens_of.iter().map(|&l| (state.lenses[l].log_focal, prior[l].1)).collect();
             let lenses = lens_of.iter().map(|&l| state.lenses[l]).collect();
             let apart = Problem { lens_of: &own, focal_prior: &own_prior, ..problem.clone() };
             let (with, new) = apart.solve(State { motion: state.motion.clone(), lenses }, 50);
-            // Focal lengths that are as good as one are one: what else got better is parallax.
+            // Without a significant spread the reduction is due to parallax.
             let focals = with.lenses.iter().map(|l| l.log_focal);
             let spread = focals.clone().fold(f64::MIN, f64::max) - focals.fold(f64::MAX, f64::min);
-            if earns(new, cost) && new < 0.8 * cost && spread > ZOOMED {
+            if is_significant(new, cost) && new < 0.8 * cost && spread > MIN_ZOOM_LOG_SPREAD {
                 return Ok(Solution { lens_of: own, prior: own_prior, state: with });
             }
         }
@@ -264,13 +265,15 @@ impl<'a> Group<'a> {
     }
 
     fn solve_homography(&self, options: &AlignOptions, stage: &Stage<'_>) -> Result<Solution, Cancelled> {
-        let (lens_of, heads) = self.lenses();
-        let prior = self.focal_guesses(&heads);
-        // Any focal length will do, as the homographies take up the difference; only what is a right angle of the scene depends on it.
-        let lenses: Vec<Lens> =
-            heads.iter().map(|&h| Lens { log_focal: self.photos[h].expected_focal().ln(), k1: 0.0 }).collect();
+        let (lens_of, representatives) = self.lenses();
+        let prior = self.focal_guesses(&representatives);
+        // The homographies absorb the focal length; only the metric frame depends on it.
+        let lenses: Vec<Lens> = representatives
+            .iter()
+            .map(|&h| Lens { log_focal: self.photos[h].expected_focal().ln(), k1: 0.0 })
+            .collect();
         let motion = self.compose(Motion::Homography, &lens_of, &lenses);
-        let few = self.few_matches();
+        let few = self.subsampled_overlaps();
         let wide =
             Problem { overlaps: &few, ..self.problem(Motion::Homography, &lens_of, &prior, 10.0 * options.outlier_px) };
         let (state, _) = wide.solve(State { motion, lenses }, 30);
@@ -289,12 +292,12 @@ impl<'a> Group<'a> {
         median(self.errors(kind, s).into_iter().flatten().collect()).sqrt()
     }
 
-    /// No photograph reaches the horizon of the common plane.
+    /// Returns whether no photograph reaches the vanishing line of the plane.
     fn in_front(&self, s: &Solution) -> bool {
         in_front(&(0..self.photos.len()).map(|i| self.view(i, s)).collect::<Vec<_>>())
     }
 
-    /// The same solution in the frame of a plan of the flat scene, as far as all photographs lie before its horizon.
+    /// Transforms the solution to the metric frame of the plane; unchanged where a photograph would reach its vanishing line.
     pub(crate) fn as_plan(&self, solution: Solution) -> Solution {
         let Some(frame) = metric_frame(&solution.state.motion) else { return solution };
         let motion = solution.state.motion.iter().map(|m| m * frame).collect();
@@ -303,7 +306,7 @@ impl<'a> Group<'a> {
         if self.in_front(&plan) { plan } else { solution }
     }
 
-    /// The pair that is least consistent with the solution, where one is not at all.
+    /// Returns the pair with the largest median residual among the inconsistent ones.
     pub(crate) fn worst_inconsistency(
         &self,
         s: &Solution,
@@ -312,7 +315,7 @@ impl<'a> Group<'a> {
     ) -> Option<usize> {
         let errors = self.errors(kind_of(motion), s);
         let typical = median(errors.iter().flatten().copied().collect()).sqrt();
-        // Parallax moves matches by some pixels; a false overlap of repeated structure is off by tens.
+        // Parallax causes residuals of a few pixels; false matches of repeated structure tens.
         let limit = (8.0 * options.outlier_px).max(6.0 * typical);
         errors
             .into_iter()
@@ -389,7 +392,7 @@ impl<'a> Group<'a> {
     }
 }
 
-/// The unknowns, found.
+/// Estimated parameters.
 pub(crate) struct Solution {
     lens_of: Vec<usize>,
     prior: Vec<(f64, f64)>,
@@ -403,7 +406,7 @@ fn kind_of(motion: CameraMotion) -> Motion {
     }
 }
 
-/// The median; 0 of nothing.
+/// Returns the median; 0 for an empty list.
 fn median(mut values: Vec<f64>) -> f64 {
     cv_core::median(&mut values).unwrap_or(0.0)
 }

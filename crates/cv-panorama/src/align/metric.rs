@@ -1,21 +1,21 @@
-//! The frame of a flat scene: that of a plan of it.
+//! Metric rectification of a planar scene.
 //!
-//! Homographies between photographs leave open which homography of the world is its plan; taking one photograph's frame gives the plan as sheared and as
-//! converging as that photograph was tilted. In a plan lengths and right angles are those of the scene, so that every camera sees its two axes as long as
-//! each other and at a right angle: for each photograph `M`, the first two columns of `M F⁻¹` (Zhang 2000, "A flexible new technique for camera calibration",
-//! §2.3). Those two equations of each photograph, all as close to true as they can be, give the four numbers of `F` beyond a similarity.
+//! Homographies between images determine the plane only up to a projective transformation `F`; the frame of one image has that image's shear and
+//! convergence. In a metric frame the first two columns of `M F⁻¹` are orthogonal and of equal length for every image `M` (Zhang 2000, "A flexible new
+//! technique for camera calibration", §2.3). These two equations per image determine the four degrees of freedom of `F` beyond a similarity, in the
+//! least-squares sense.
 
 use crate::align::View;
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
 use nalgebra::{Const, Matrix3, Point2, SVector, Vector3};
 
-/// What holds the frame where the photographs say nothing of it, relative to an equation of theirs.
-const BELIEF: f64 = 1e-6;
+/// Weight of the regularization (toward the identity) relative to one equation of an image: decides only where the images do not determine `F`.
+const PRIOR_WEIGHT: f64 = 1e-6;
 
-/// The photographs' matrices, and the plan so far.
+/// Least-squares problem over the homographies of the images.
 struct Squareness<'a>(&'a [Matrix3<f64>]);
 
-/// The first two columns of `F⁻¹`: stretched by `e^a` and `e^−a`, sheared by `b`, its horizon `(p, q)`.
+/// Returns the first two columns of `F⁻¹`: stretched by `e^a` and `e^−a`, sheared by `b`, with vanishing line `(p, q)`.
 fn axes(x: &SVector<f64, 4>) -> [Vector3<f64>; 2] {
     [Vector3::new(x[0].exp(), 0.0, x[2]), Vector3::new(x[1], (-x[0]).exp(), x[3])]
 }
@@ -43,7 +43,7 @@ impl LeastSquares for Squareness<'_> {
         for m in self.0 {
             let (g, h) = (m * u, m * v);
             let size = g.norm_squared() + h.norm_squared();
-            // Each is a quotient; d is a change of (u, v).
+            // Each residual is a quotient; d is a change of (u, v).
             let by = |du: Vector3<f64>, dv: Vector3<f64>| -> [f64; 3] {
                 let (dg, dh) = (m * du, m * dv);
                 let (gg, hh) = (2.0 * g.dot(&dg), 2.0 * h.dot(&dh));
@@ -58,7 +58,7 @@ impl LeastSquares for Squareness<'_> {
             }
         }
         for i in 0..4 {
-            add(x[i], &SVector::ith(i, 1.0), BELIEF);
+            add(x[i], &SVector::ith(i, 1.0), PRIOR_WEIGHT);
         }
         equations
     }
@@ -68,13 +68,13 @@ impl LeastSquares for Squareness<'_> {
     }
 }
 
-/// What turns the frame of homographies (of a flat world to cameras of focal length 1) into that of a plan, `M ← M F⁻¹`: the answer is `F⁻¹`. The middle of the
-/// photographs is at the origin, their median scale 1 there, and they stand upright as far as they agree on it. `None` where there is none.
+/// Computes `F⁻¹`, which takes homographies (of a plane to cameras of focal length 1) to the metric frame: `M ← M F⁻¹`. The centroid of the images is
+/// at the origin, their median scale is 1, and they are upright on average. `None` where there is no such frame.
 pub(crate) fn metric_frame(motions: &[Matrix3<f64>]) -> Option<Matrix3<f64>> {
     let options = LmOptions { max_iterations: 100, ..LmOptions::default() };
     let [u, v] = axes(&levenberg_marquardt(&Squareness(motions), SVector::zeros(), &options).params);
     let plan = Matrix3::from_columns(&[u, v, Vector3::z()]);
-    // Where each photograph's axis meets the plan, and the change of that place by pixels.
+    // Intersection of each optical axis with the plane, and its derivatives by pixels.
     let mut scales = Vec::with_capacity(motions.len());
     let (mut middle, mut heading) = (Point2::origin(), [0.0; 2]);
     for m in motions {
@@ -89,16 +89,16 @@ pub(crate) fn metric_frame(motions: &[Matrix3<f64>]) -> Option<Matrix3<f64>> {
         heading = [heading[0] + turn[0] / length, heading[1] + turn[1] / length];
     }
     let scale = cv_core::median(&mut scales)?;
-    // Photographs taken on all sides agree on nothing: then the frame stays as it is.
+    // Images of all orientations have no mean heading: the frame is not rotated.
     let length = heading[0].hypot(heading[1]);
     let [c, s] = if length > 0.5 * motions.len() as f64 { heading.map(|v| v / length) } else { [1.0, 0.0] };
-    // Of a place of the final plan, its place in the former.
+    // Maps points of the final frame to the former one.
     let back = Matrix3::new(scale * c, -scale * s, middle.x, scale * s, scale * c, middle.y, 0.0, 0.0, 1.0);
     let frame = plan * back;
     frame.iter().all(|v| v.is_finite()).then_some(frame)
 }
 
-/// Whether no view reaches the horizon of the plane they show.
+/// Returns whether no image reaches the vanishing line of the plane.
 pub(crate) fn in_front(views: &[View]) -> bool {
     views.iter().all(|view| {
         let Some(inverse) = view.from_world.try_inverse() else { return false };

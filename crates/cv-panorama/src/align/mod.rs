@@ -1,29 +1,31 @@
-//! From verified overlaps to the place of every photograph.
+//! Alignment: from verified pairs to the pose and intrinsics of every photograph.
 
 mod bundle;
 mod focal;
 mod group;
 mod metric;
+mod refine;
 mod straighten;
 mod view;
 
+pub use refine::refine_alignment;
 pub(crate) use straighten::turn;
 pub use view::View;
 
-use cv_core::{Camera, Cancelled, Correspondence, Progress, Scaling, Stage, named};
+use cv_core::{Camera, Cancelled, Correspondence, Point2, Progress, Scaling, Stage, named};
 use cv_geometry::VerifiedPair;
 use group::Group;
 
-/// What is known about a photograph before looking at its pixels.
+/// A photograph's size and what is known of its intrinsics beforehand.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Photo {
     /// Width in pixels.
     pub width: usize,
     /// Height in pixels.
     pub height: usize,
-    /// Focal length in pixels, from EXIF: a hint that the overlaps may correct.
+    /// Prior focal length in pixels, from EXIF; refined by the adjustment.
     pub focal: Option<f64>,
-    /// The calibrated camera, which is believed as it is. Its size must be the photograph's.
+    /// The calibrated camera; kept constant. Its size must be that of the photograph.
     pub camera: Option<Camera>,
 }
 
@@ -33,7 +35,7 @@ impl Photo {
         Self { width, height, focal: None, camera: None }
     }
 
-    /// Photographs that are taken to share a lens: the same size (either way up) and the same hint.
+    /// Returns whether two photographs share their intrinsics: equal size (in either orientation) and equal prior.
     pub(crate) fn shares_lens(&self, other: &Self) -> bool {
         let size = |p: &Self| (p.width.min(p.height), p.width.max(p.height));
         let same_hint = match (self.focal, other.focal) {
@@ -48,23 +50,23 @@ impl Photo {
         self.width.max(self.height) as f64
     }
 
-    /// The focal length of the camera, that of EXIF, or the long side: 53° across, a usual wide lens.
+    /// Returns the focal length of the camera, that of EXIF, or the longer side: a field of view of 53°, a common wide-angle lens.
     pub(crate) fn expected_focal(&self) -> f64 {
         let known = self.camera.map(|c| c.fx).or(self.focal.filter(|f| f.is_finite() && *f > 0.0));
         known.unwrap_or_else(|| self.long_side())
     }
 }
 
-/// What may have moved the camera between photographs.
+/// Motion model of the camera between photographs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum CameraMotion {
-    /// [`Rotation`](Self::Rotation), unless [`Homography`](Self::Homography) explains the matches far better.
+    /// [`Rotation`](Self::Rotation), unless [`Homography`](Self::Homography) has far smaller residuals.
     #[default]
     Auto,
-    /// The camera turned about its center: the panorama proper.
+    /// Rotation about the camera center.
     Rotation,
-    /// The scene is flat (a wall, a page, the ground from above) and the camera moved anyhow. The result is a plan of it, without shear or convergence, as far
-    /// as the focal length is known; without, 53 degrees across are assumed, and what all photographs are tilted alike remains.
+    /// Planar scene (a wall, a page, the ground from above) and arbitrary camera motion. The result is metrically rectified as far as the focal length is
+    /// known; without, a field of view of 53 degrees is assumed, and a tilt common to all photographs remains.
     Homography,
 }
 
@@ -73,14 +75,13 @@ named!(CameraMotion { Auto = "auto", Rotation = "rotation", Homography = "plane"
 /// Options of [`align`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AlignOptions {
-    /// What moved the camera. Default [`CameraMotion::Auto`].
+    /// Motion model. Default [`CameraMotion::Auto`].
     pub motion: CameraMotion,
-    /// Error of a match, in pixels, at which it starts to count less (the scale of a Cauchy loss), above 0. Default 2, the σ that
-    /// Brown & Lowe give their robust loss.
+    /// Scale of the Cauchy loss on transfer errors, in pixels, above 0. Default 2, the σ of Brown & Lowe's robust loss.
     pub outlier_px: f64,
-    /// Estimate one coefficient of radial distortion where no camera is given and the matches ask for it. Default true.
+    /// Estimate one radial distortion coefficient where no camera is given and it reduces the cost significantly. Default true.
     pub refine_distortion: bool,
-    /// Turn the result level. Default true; false keeps the frame of the middle photograph.
+    /// Level the result (wave correction). Default true; false keeps the frame of the reference photograph.
     pub straighten: bool,
 }
 
@@ -94,19 +95,19 @@ impl Default for AlignOptions {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum AlignError {
-    /// A panorama needs two photographs.
+    /// Fewer than two photographs.
     #[error("a panorama needs at least 2 photographs, got {got}")]
     TooFewPhotos {
         /// Photographs given.
         got: usize,
     },
-    /// No two photographs overlap as far as the matches tell.
+    /// There is no verified pair.
     #[error("no two of the {photos} photographs overlap")]
     NoOverlap {
         /// Photographs given.
         photos: usize,
     },
-    /// A pair names a photograph that is not there, or itself.
+    /// A pair has an index out of range, or twice the same.
     #[error("a pair names photographs {a} and {b} of {photos}")]
     BadPair {
         /// First of the pair.
@@ -116,7 +117,7 @@ pub enum AlignError {
         /// Photographs given.
         photos: usize,
     },
-    /// A photograph is empty, or its camera is no camera or of another size.
+    /// A photograph is empty, or its camera is invalid or of another size.
     #[error("photograph {index} is empty or its camera does not fit it")]
     BadPhoto {
         /// Which.
@@ -125,7 +126,7 @@ pub enum AlignError {
     /// The work was stopped by its progress callback.
     #[error(transparent)]
     Cancelled(#[from] Cancelled),
-    /// No placement explains the matches.
+    /// No alignment is consistent with the matches.
     #[error("the overlaps of the {photos} photographs contradict each other")]
     Inconsistent {
         /// Photographs in the group.
@@ -133,56 +134,56 @@ pub enum AlignError {
     },
 }
 
-/// Why a photograph is not in the panorama.
+/// Why a photograph is not registered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unplaced {
-    /// It overlaps no other photograph.
+    /// It has no verified pair.
     NoOverlap,
     /// It belongs to another, smaller component of the match graph.
     OtherComponent {
         /// Photographs in that component.
         size: usize,
     },
-    /// Its overlaps contradict those of the others.
+    /// Its pairs are inconsistent with the others.
     Inconsistent,
 }
 
-/// An overlap that holds in the whole.
+/// A pair that is consistent with the alignment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AlignedPair {
     /// First photograph.
     pub a: usize,
     /// Second photograph.
     pub b: usize,
-    /// Indices of its matches among the tentative ones, as in [`VerifiedPair::inliers`].
+    /// Indices of the inliers among the tentative matches, as in [`VerifiedPair::inliers`].
     pub inliers: Vec<usize>,
     /// The matches, in pixels.
     pub matches: Vec<Correspondence>,
-    /// Root mean square of their errors, in pixels.
+    /// Root mean square transfer error, in pixels.
     pub rms_px: f64,
 }
 
-/// The place of every photograph.
+/// Poses and intrinsics of all photographs.
 #[derive(Debug, Clone)]
 pub struct Alignment {
-    /// The view of each photograph, or why it has none; as many as photographs were given.
+    /// The view of each photograph, or why it is not registered; one entry per input.
     pub views: Vec<Result<View, Unplaced>>,
-    /// The photograph in the middle of the match graph.
+    /// The photograph in the center of the match graph.
     pub reference: usize,
     /// [`CameraMotion::Rotation`] or [`CameraMotion::Homography`].
     pub motion: CameraMotion,
-    /// The overlaps that hold.
+    /// The consistent pairs.
     pub pairs: Vec<AlignedPair>,
-    /// Root mean square error of all their matches, in pixels, the mean of the two directions.
+    /// Root mean square transfer error of all matches, in pixels, averaged over both directions.
     pub rms_px: f64,
-    /// Median error of all their matches, in pixels.
+    /// Median transfer error of all matches, in pixels.
     pub median_px: f64,
 }
 
 impl Alignment {
-    /// The same alignment of photographs of other sizes: each made `factor` times as large and then of `size`.
+    /// Returns the alignment of the photographs resized: each scaled by its factor and then of the given size.
     ///
-    /// Errors are scaled by the median factor of the photographs used.
+    /// Errors are scaled by the median factor of the registered photographs.
     pub fn resized(&self, sizes: &[(f64, (usize, usize))]) -> Self {
         let mut out = self.clone();
         for (view, (factor, size)) in out.views.iter_mut().zip(sizes) {
@@ -208,17 +209,34 @@ impl Alignment {
         out
     }
 
-    /// The photographs in the panorama.
+    /// Recomputes the errors of all matches.
+    fn measure(&mut self) {
+        let rms = |squares: &[f64]| (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt();
+        let mut all = Vec::new();
+        for pair in &mut self.pairs {
+            let (Some(Ok(a)), Some(Ok(b))) = (self.views.get(pair.a), self.views.get(pair.b)) else { continue };
+            let square =
+                |from: &View, to: &View, p, q: Point2<f64>| Some((to.project(&from.ray(p)?)? - q).norm_squared());
+            let both = |m: &Correspondence| Some(0.5 * (square(a, b, m.a, m.b)? + square(b, a, m.b, m.a)?));
+            let squares: Vec<f64> = pair.matches.iter().filter_map(both).collect();
+            pair.rms_px = rms(&squares);
+            all.extend(squares);
+        }
+        self.rms_px = rms(&all);
+        self.median_px = cv_core::median(&mut all).unwrap_or(0.0).sqrt();
+    }
+
+    /// Iterates over the registered photographs.
     pub fn used(&self) -> impl Iterator<Item = (usize, &View)> {
         self.views.iter().enumerate().filter_map(|(i, v)| v.as_ref().ok().map(|v| (i, v)))
     }
 }
 
-/// Places photographs by their verified overlaps: spanning tree from the middle of the match graph, then all cameras at once over all
-/// overlaps under a robust loss, then the world turned level.
+/// Aligns photographs by their verified pairs: initialization along the spanning tree from the center of the match graph, bundle adjustment over all
+/// overlaps with a robust loss, then leveling.
 ///
-/// The largest group of connected photographs is placed. Focal lengths come from the cameras, the hints, or the homographies
-/// themselves. Costs O(matches · iterations + photographs³). Reports as the stage "align", whose length is unknown.
+/// Registers the largest connected component. Focal lengths come from the cameras, the priors, or the homographies. Complexity
+/// O(matches · iterations + photographs³). Reports as the stage "align", of unknown length.
 ///
 /// # Errors
 /// [`AlignError`].
@@ -242,7 +260,7 @@ pub fn align(
     if let Some(bad) = pairs.iter().find(|p| p.a >= n || p.b >= n || p.a == p.b) {
         return Err(AlignError::BadPair { a: bad.a, b: bad.b, photos: n });
     }
-    // In an order of their own, so that the order of the pairs changes nothing.
+    // Sorted: the result must not depend on the order of the input pairs.
     let mut pairs: Vec<&VerifiedPair> = pairs.iter().filter(|p| !p.matches.is_empty()).collect();
     pairs.sort_by_key(|p| (p.a.min(p.b), p.a.max(p.b)));
     let mut inconsistent = vec![false; n];
@@ -251,7 +269,7 @@ pub fn align(
         let (solution, motion) = group.solve(options, &stage)?;
         let bad = group.worst_inconsistency(&solution, motion, options);
         if let Some(bad) = bad {
-            // One at a time: a false overlap bends the true ones around it.
+            // One at a time: a false pair raises the residuals of the pairs around it.
             let pair = group.pairs[bad];
             pairs.retain(|p| !std::ptr::eq(*p, pair));
             for i in [pair.a, pair.b] {
@@ -360,7 +378,7 @@ mod tests {
     }
 
     #[test]
-    fn a_false_overlap_is_left_out_and_the_others_hold() {
+    fn a_false_pair_is_rejected_and_the_others_are_kept() {
         let truth = sweep();
         let mut pairs = pairs(&truth);
         // The first and the last, which show nothing in common, "match" like two neighbors: repeated windows.
@@ -375,7 +393,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flat_scene_is_told_from_a_turned_camera() {
+    fn a_planar_scene_is_distinguished_from_a_rotating_camera() {
         // A wall seen from three places: homographies that no rotation explains.
         let pose = |x: f64, skew: f64| Matrix3::new(1.0, 0.02, x, 0.01, 1.0, 0.0, skew, 0.0, 1.0);
         let truth: Vec<View> = [pose(0.0, 0.0), pose(-0.35, 0.15), pose(-0.7, -0.12)]
@@ -456,7 +474,7 @@ mod tests {
     }
 
     #[test]
-    fn a_calibrated_camera_is_believed_and_a_hint_is_not_when_it_is_wrong() {
+    fn a_calibrated_camera_stays_constant_and_a_wrong_prior_is_corrected() {
         let truth = sweep();
         let pairs = pairs(&truth);
         let camera = truth[0].camera;
@@ -497,7 +515,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_aligned_says_why() {
+    fn invalid_input_gives_typed_errors() {
         let truth = sweep();
         let pairs = pairs(&truth);
         let go = |photos: &[Photo], pairs: &[VerifiedPair]| {
@@ -517,7 +535,7 @@ mod tests {
     }
 
     #[test]
-    fn at_whatever_report_it_is_stopped_it_says_so() {
+    fn alignment_is_cancelled_at_any_report() {
         let truth = sweep();
         let pairs = pairs(&truth);
         let watched = StopAt::never();

@@ -2,24 +2,24 @@
 
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
-/// Standard deviation of the roll of a photograph: people level its sides to a degree or two. In radians, as the sines that are compared.
-const ROLL: f64 = 1.5 * std::f64::consts::PI / 180.0;
-/// That of its pitch: they tilt the camera up and down.
-const PITCH: f64 = 15.0 * std::f64::consts::PI / 180.0;
-/// Deviations of the roll up to which a photograph counts as held level: beyond, it was taken on its side or aslant and tells nothing of the horizon. Less
-/// than what a view straight up or down costs (1 / 0.26² = 15 for its pitch), or one photograph on its side would turn another's optical axis upright.
-const LEVEL: f64 = 3.5;
-/// Pairs of photographs whose common horizon is tried at the most.
-const MOST_PAIRS: usize = 2000;
+/// Standard deviation of camera roll in radians: hand-held photographs are level to a degree or two.
+const ROLL_SIGMA: f64 = 1.5 * std::f64::consts::PI / 180.0;
+/// Standard deviation of camera pitch in radians.
+const PITCH_SIGMA: f64 = 15.0 * std::f64::consts::PI / 180.0;
+/// Truncation of the roll residual in standard deviations: photographs beyond are outliers (portrait or slanted). Must stay below the pitch cost of a
+/// vertical view (1 / 0.26² = 15), or one portrait photograph would turn another's optical axis upright.
+const MAX_ROLL_SIGMAS: f64 = 3.5;
+/// Maximum number of pairs tried as hypotheses.
+const MAX_PAIR_HYPOTHESES: usize = 2000;
 
-/// The rotation of the world after which the panorama is level, the right side up and centered on the Z axis (Brown & Lowe 2007, §5).
+/// Computes the world rotation after which the panorama is level, upright and centered on the Z axis (wave correction; Brown & Lowe 2007, §5).
 ///
-/// `rotations` are world to camera. The horizontal axes of photographs that were held level lie in the horizon's plane, so its normal, "up", is the
-/// direction in which they vary least. Where they all agree (a camera tilted straight up and down, or hardly turned) that leaves a
-/// choice, which the views' own middle decides: `up` minimizes `Σ min((x_i·u)² / σ_r², 3.5²) + Σ (z_i·u)² / σ_p²`. The truncation leaves out photographs on
-/// their side. Hypotheses are of one or two photographs, at most 2000 + n, each compared with all: O(n³) for few photographs, O(n²) for many.
+/// `rotations` are world to camera. The x axes of level cameras span the horizontal plane, so "up" is the direction `u` of their least variance. That is
+/// ambiguous where all x axes are parallel (a camera that only tilted), hence the optical axes contribute with a larger standard deviation: `u` minimizes
+/// `Σ min((x_i·u)² / σ_roll², 3.5²) + Σ (z_i·u)² / σ_pitch²`. The truncation rejects portrait photographs. Hypotheses come from minimal samples of one or two
+/// photographs, at most 2000 + n, each scored on all: O(n³) for few photographs, O(n²) for many.
 ///
-/// The answer `S` is to be applied as `R_i ← R_i Sᵀ`: `S` takes old world directions to new ones.
+/// The result `S` maps old to new world directions: apply it as `R_i ← R_i Sᵀ`.
 pub(crate) fn straighten(rotations: &[Matrix3<f64>]) -> Matrix3<f64> {
     let level_ones = level_photographs(rotations);
     let mut y = normal(level_ones.iter().map(|&i| &rotations[i]));
@@ -30,49 +30,50 @@ pub(crate) fn straighten(rotations: &[Matrix3<f64>]) -> Matrix3<f64> {
         y = -y;
     }
     let z = level(&ahead, &y)
-        // Views all around add up to nothing: any of them is as good a middle.
+        // The optical axes of a full circle cancel: any one of them serves as the center.
         .or_else(|| rotations.iter().find_map(|r| level(&r.row(2).transpose(), &y)))
         .unwrap_or_else(|| level(&Vector3::x(), &y).unwrap_or_else(Vector3::z));
     let x = y.cross(&z);
     Matrix3::from_rows(&[x.transpose(), y.transpose(), z.transpose()])
 }
 
-/// The vertical of some photographs, up or down, as if all were held level.
+/// Estimates the vertical (of either sign) from photographs taken as level.
 fn normal<'a>(rotations: impl Iterator<Item = &'a Matrix3<f64>>) -> Vector3<f64> {
     let mut spread = Matrix3::zeros();
     for r in rotations {
         let (x, z) = (r.row(0).transpose(), r.row(2).transpose());
-        spread += x * x.transpose() + (ROLL / PITCH).powi(2) * z * z.transpose();
+        spread += x * x.transpose() + (ROLL_SIGMA / PITCH_SIGMA).powi(2) * z * z.transpose();
     }
     let eigen = spread.symmetric_eigen();
     eigen.eigenvectors.column(eigen.eigenvalues.imin()).into_owned()
 }
 
-/// The photographs that were held level: most of them, and those that agree best where they do not all agree.
+/// Returns the inliers of the best hypothesis: the photographs taken as level.
 fn level_photographs(rotations: &[Matrix3<f64>]) -> Vec<usize> {
     let n = rotations.len();
-    let roll = |r: &Matrix3<f64>, u: &Vector3<f64>| (r.row(0).transpose().dot(u) / ROLL).powi(2);
+    let roll = |r: &Matrix3<f64>, u: &Vector3<f64>| (r.row(0).transpose().dot(u) / ROLL_SIGMA).powi(2);
     let cost = |u: &Vector3<f64>| -> f64 {
-        let pitch = |r: &Matrix3<f64>| (r.row(2).transpose().dot(u) / PITCH).powi(2);
-        rotations.iter().map(|r| roll(r, u).min(LEVEL * LEVEL) + pitch(r)).sum()
+        let pitch = |r: &Matrix3<f64>| (r.row(2).transpose().dot(u) / PITCH_SIGMA).powi(2);
+        rotations.iter().map(|r| roll(r, u).min(MAX_ROLL_SIGMAS * MAX_ROLL_SIGMAS) + pitch(r)).sum()
     };
-    let level =
-        |u: &Vector3<f64>| -> Vec<usize> { (0..n).filter(|&i| roll(&rotations[i], u) < LEVEL * LEVEL).collect() };
+    let level = |u: &Vector3<f64>| -> Vec<usize> {
+        (0..n).filter(|&i| roll(&rotations[i], u) < MAX_ROLL_SIGMAS * MAX_ROLL_SIGMAS).collect()
+    };
     let mut best = normal(rotations.iter());
     let mut least = cost(&best);
-    // The first of equals: where all are level, all of them say where the horizon is.
+    // Ties keep the first hypothesis, which uses all photographs.
     let mut consider = |u: Vector3<f64>| {
         let cost = cost(&u);
         if cost < least * (1.0 - 1e-9) {
             (best, least) = (u, cost);
         }
     };
-    let stride = (n * n.saturating_sub(1) / 2).div_ceil(MOST_PAIRS).max(1);
+    let stride = (n * n.saturating_sub(1) / 2).div_ceil(MAX_PAIR_HYPOTHESES).max(1);
     let pairs = (0..n).flat_map(|i| (i..n).map(move |j| (i, j)));
     for (_, (i, j)) in pairs.enumerate().filter(|(k, (i, j))| i == j || k % stride == 0) {
         consider(normal([&rotations[i], &rotations[j]].into_iter()));
     }
-    // All that agree with the best hypothesis have a say.
+    // Refit to the inliers.
     for _ in 0..4 {
         let refined = normal(level(&best).iter().map(|&i| &rotations[i]));
         let cost = cost(&refined);
@@ -87,12 +88,12 @@ fn level_photographs(rotations: &[Matrix3<f64>]) -> Vec<usize> {
     }
 }
 
-/// The part of `v` at right angles to `y`, of unit length.
+/// Returns the component of `v` orthogonal to `y`, normalized.
 fn level(v: &Vector3<f64>, y: &Vector3<f64>) -> Option<Vector3<f64>> {
     (v - y * v.dot(y)).try_normalize(1e-3)
 }
 
-/// The turn about the vertical that brings longitude `angle` (from Z toward X) to the middle.
+/// Returns the rotation about the vertical that takes longitude `angle` (from Z toward X) to the Z axis.
 pub(crate) fn turn(angle: f64) -> Matrix3<f64> {
     Rotation3::from_axis_angle(&Vector3::y_axis(), -angle).into_inner()
 }
@@ -143,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn photographs_on_their_side_tell_nothing_of_the_horizon() {
+    fn rotated_photographs_are_rejected_as_outliers() {
         use std::f64::consts::FRAC_PI_2;
         let degrees = |angle: f64| angle * std::f64::consts::PI / 180.0;
         for odd in [FRAC_PI_2, -FRAC_PI_2, degrees(30.0), degrees(-30.0), 2.0 * FRAC_PI_2] {

@@ -1,27 +1,27 @@
-//! How one photograph looks at the panorama's world.
+//! The pose and intrinsics of one photograph in the panorama.
 
 use cv_core::{Camera, Matrix3, Point2, Vector3};
 
-/// A photograph placed in the panorama's world: `pixel ~ camera(from_world · ray)`.
+/// The projection of a photograph: `pixel ~ camera(from_world · ray)`.
 ///
-/// `from_world` is a rotation where the camera turned about its center, and any invertible 3×3 where the scene is flat and the
-/// camera moved. World frame: X right, Y down, Z forward, the middle of the panorama on the Z axis.
+/// `from_world` is a rotation for a camera rotating about its center, and any invertible 3×3 matrix (a homography) for a planar scene.
+/// World frame: X right, Y down, Z forward toward the center of the panorama.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct View {
     /// Size, focal length, principal point and lens distortion, in pixels of the photograph.
     pub camera: Camera,
-    /// World ray to camera ray, up to a positive scale.
+    /// World ray to camera ray, up to a positive factor.
     pub from_world: Matrix3<f64>,
 }
 
 impl View {
-    /// The pixel at which the photograph sees the direction `ray`, whether or not that lies inside it; `None` behind the camera.
+    /// Projects the direction `ray` to a pixel, which may lie outside the image; `None` behind the camera.
     pub fn project(&self, ray: &Vector3<f64>) -> Option<Point2<f64>> {
         let p = self.from_world * ray;
         (p.z > 1e-9 * p.norm()).then(|| self.camera.denormalize(Point2::new(p.x / p.z, p.y / p.z)))
     }
 
-    /// The world direction of a pixel, of unit length; `None` where no ray reaches the pixel (beyond the lens model's range).
+    /// Back-projects a pixel to a world direction of unit length; `None` outside the range of the distortion model.
     pub fn ray(&self, pixel: Point2<f64>) -> Option<Vector3<f64>> {
         let n = self.camera.normalize(pixel);
         let inverse = self.from_world.try_inverse()?;
@@ -29,17 +29,17 @@ impl View {
         ray.iter().all(|v| v.is_finite()).then_some(ray)
     }
 
-    /// True where the pixel lies on the photograph.
+    /// Returns whether the pixel lies inside the image.
     pub fn contains(&self, p: Point2<f64>) -> bool {
         p.x >= 0.0 && p.y >= 0.0 && p.x <= self.camera.width as f64 - 1.0 && p.y <= self.camera.height as f64 - 1.0
     }
 
-    /// The same view of the photograph resized by `factor`.
+    /// Returns the view of the image resized by `factor`.
     pub fn scaled(&self, factor: f64) -> Self {
         Self { camera: self.camera.scaled(factor), from_world: self.from_world }
     }
 
-    /// Points along the photograph's border, `per_side` to a side, in order.
+    /// Samples the image border in order, `per_side` points per side.
     pub(crate) fn border(&self, per_side: usize) -> Vec<Point2<f64>> {
         let (w, h) = (self.camera.width as f64 - 1.0, self.camera.height as f64 - 1.0);
         let n = per_side.max(1);

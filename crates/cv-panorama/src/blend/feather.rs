@@ -1,14 +1,14 @@
-//! A linear transition across the seams.
+//! Feathering: a linear transition across the seams.
 
+use crate::bit_depth::Channel;
 use crate::blend::{Blender, Composition, NO_PHOTO};
-use crate::depth::Channel;
-use crate::rows::{asks, for_each_row};
+use crate::rows::{for_each_row, is_check_due};
 use cv_core::{Cancelled, Image, Progress, Stage};
 
-/// Half the width of the transition in pixels.
+/// Half width of the transition in pixels.
 const RADIUS: usize = 8;
 
-/// Photographs weighted by the share of the labels in the square of `2 · RADIUS + 1` around each pixel that name them.
+/// Weights each photograph by the box-filtered indicator of its label, kernel side `2 · RADIUS + 1`.
 pub(crate) struct Feather;
 
 impl<T: Channel> Blender<T> for Feather {
@@ -21,7 +21,7 @@ impl<T: Channel> Blender<T> for Feather {
             let Some(photo) = photo else { continue };
             let b = photo.bounds;
             let (pw, ph) = (b.width(), b.height());
-            // The label's own pixels, averaged over a square: along rows, then along columns by running sums of whole rows.
+            // Separable box filter of the label's indicator by running sums.
             let mut across = vec![0.0_f32; pw * ph];
             for_each_row(&mut across, pw, &stage, |y, row| {
                 let names = &labels.row(b.top + y)[b.left..][..pw];
@@ -42,7 +42,7 @@ impl<T: Channel> Blender<T> for Feather {
                 column.iter_mut().zip(&across[y * pw..(y + 1) * pw]).for_each(|(s, v)| *s += v);
             }
             for y in 0..ph {
-                if asks(y, pw) {
+                if is_check_due(y, pw) {
                     stage.check()?;
                 }
                 if y + RADIUS < ph {

@@ -1,7 +1,7 @@
-//! Every pixel from the photograph that its label names.
+//! Compositing without blending: every pixel is copied from the photograph of its label.
 
+use crate::bit_depth::Channel;
 use crate::blend::{Blender, Composition};
-use crate::depth::Channel;
 use crate::rows::for_each_row;
 use cv_core::{Cancelled, Image, Progress, Stage};
 
@@ -17,7 +17,7 @@ impl<T: Channel> Blender<T> for HardSeams {
     }
 }
 
-/// The picture with hard seams.
+/// Composites the image with hard seams.
 pub(crate) fn copy<T: Channel>(composition: &Composition<'_, T>, stage: &Stage<'_>) -> Result<Image<T, 3>, Cancelled> {
     let (w, h) = composition.labels.size();
     let mut image = Image::new(w, h, [T::default(); 3]);

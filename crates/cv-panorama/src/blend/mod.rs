@@ -1,73 +1,73 @@
-//! From photographs drawn on the canvas to one picture: their exposure evened out, then joined at the seams.
+//! Blending of warped, exposure-compensated photographs along the seams.
 //!
-//! A blend mode is one file of this folder with an implementation of [`Blender`], and a variant of [`BlendMode`] with its name and its line in `blender`. One
-//! from outside this crate implements [`Blender`] and goes to [`render_with`](crate::render_with).
+//! A blend mode is one file of this module with a [`Blender`], a variant of [`BlendMode`] with its name, and an arm of `of_mode`. A blender of another crate is
+//! passed to [`render_with`](crate::render_with).
 
 mod feather;
 mod hard_seams;
 mod multiband;
 mod poisson;
 
-use crate::depth::{Channel, PhotoSample};
+use crate::bit_depth::{Channel, PhotoSample};
 use crate::surface::WarpedPhoto;
 use cv_core::{Cancelled, Image, Progress, named};
 
-/// The label of canvas pixels that no photograph reaches.
+/// The label of canvas pixels that no photograph covers.
 pub const NO_PHOTO: u16 = u16::MAX;
 
-/// Photographs drawn on a canvas, and which of them each pixel is to be taken from.
+/// Warped photographs and a label image that selects one of them per pixel.
 #[derive(Debug, Clone, Copy)]
 pub struct Composition<'a, T = u8> {
-    /// The photographs, exposure evened out, in an order that depends on their places only; `None` where no label names one. Each
-    /// reaches beyond the pixels of its label as [`Blender::pyramid_levels`] asks.
+    /// The photographs after exposure compensation; `None` for those without a label. Each extends beyond the pixels of its label by the margin of
+    /// [`Blender::pyramid_levels`].
     pub photos: &'a [Option<WarpedPhoto<T>>],
-    /// For each canvas pixel an index into `photos`, [`NO_PHOTO`] where none reaches. A photograph reaches every pixel of its label.
+    /// Index into `photos` per canvas pixel, [`NO_PHOTO`] where none covers it. A photograph covers every pixel of its label.
     pub labels: &'a Image<u16, 1>,
     /// Median over the photographs of the square root of their area on the canvas, in pixels.
     pub typical_side: f64,
 }
 
-/// Joins photographs at the seams between their labels. One that is for bytes and for samples of 16 bits is implemented for both.
+/// Blends photographs along the seams between their labels. Implement it for `u8` and `u16` to support both bit depths.
 pub trait Blender<T: Channel = u8>: Sync {
-    /// How far photographs must be drawn beyond the pixels of their labels, as the levels of a pyramid above its base: each is drawn on
-    /// the box around its pixels, grown by `2 · 2^levels` pixels and rounded out to multiples of `2^levels` (within the canvas). Where a
-    /// photograph does not reach, its edge pixels are repeated with an opacity of 0. Default 4: 32 pixels.
+    /// Returns the margin by which photographs are warped beyond the pixels of their labels, as the number of pyramid levels above the base: the bounding
+    /// box of a label is grown by `2 · 2^levels` pixels and rounded out to multiples of `2^levels` (clipped to the canvas). Outside a photograph its border
+    /// pixels are replicated with opacity 0. Default 4: 32 pixels.
     fn pyramid_levels(&self, typical_side: f64) -> usize {
         let _ = typical_side;
         4
     }
 
-    /// The picture, of the size of the labels; black where they say [`NO_PHOTO`]. Reports as the stage "blend", a few hundred times.
+    /// Returns the blended image, of the size of the labels; black where they are [`NO_PHOTO`]. Reports as the stage "blend", a few hundred times.
     ///
     /// # Errors
     /// [`Cancelled`] where `progress` says so.
     fn blend(&self, composition: &Composition<'_, T>, progress: &dyn Progress) -> Result<Image<T, 3>, Cancelled>;
 }
 
-/// How photographs are joined at the seams.
+/// Blending algorithm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum BlendMode {
-    /// Each frequency band over a transition as wide as itself (Burt & Adelson 1983).
+    /// Multi-band blending: each frequency band over a transition of its own wavelength (Burt & Adelson 1983).
     #[default]
     Multiband,
-    /// In the gradient domain (Pérez et al. 2003): differences at the seams are spread over the whole picture, which keeps its own border free.
+    /// Gradient-domain blending (Pérez et al. 2003) with Neumann boundary conditions: differences at the seams are spread over the whole image.
     Poisson,
-    /// A linear transition of 16 pixels.
+    /// Feathering: a linear transition of 16 pixels.
     Feather,
-    /// Hard seams.
+    /// None: hard seams.
     None,
 }
 
 named!(BlendMode { Multiband = "multiband", Poisson = "poisson", Feather = "feather", None = "none" });
 
 impl BlendMode {
-    /// The implementation.
+    /// Returns the implementation.
     pub fn blender<T: PhotoSample>(self) -> &'static dyn Blender<T> {
         T::blender(self)
     }
 }
 
-/// The implementation, compiled where it is called.
+/// Returns the implementation, generic over the sample type.
 pub(crate) fn of_mode<T: Channel>(mode: BlendMode) -> &'static dyn Blender<T> {
     match mode {
         BlendMode::Multiband => &multiband::Multiband,

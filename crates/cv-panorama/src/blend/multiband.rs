@@ -1,14 +1,13 @@
 //! Multi-band blending (Burt & Adelson 1983): low frequencies over a wide transition, high ones over a narrow one.
 //!
-//! Pixels are `[red, green, blue, weight]`, one vector register each. A photograph's weight is one where the labels name it and zero
-//! elsewhere; its pyramid is blurred and halved along with the colors. Outside a photograph its edge pixels are repeated (see `warp`), so no
-//! band knows of a border and nothing dark bleeds in.
+//! Pixels are `[red, green, blue, weight]`, one vector register each. The weight of a photograph is the indicator of its label; its Gaussian pyramid is built
+//! along with that of the colors. Outside a photograph its border pixels are replicated (see `warp`), so that no dark border bleeds in.
 //!
-//! In full size a pixel has one photograph `k` of weight one, so that its band is `p_k − up(G_k)`, with `G_k` the photograph at half the size. With `C` the
-//! blended canvas at half the size the result is `p_k + up(C − G_k)`: nothing in full size is kept but the bytes that came and the bytes that go.
+//! At full resolution each pixel has one photograph `k` of weight one, so its Laplacian band is `p_k − up(G_k)`, with `G_k` the photograph at half resolution.
+//! With `C` the blended canvas at half resolution the result is `p_k + up(C − G_k)`: no float image of full resolution is stored.
 
+use crate::bit_depth::{Channel, Sum};
 use crate::blend::{Blender, Composition};
-use crate::depth::{Channel, Sum};
 use crate::rows::for_each_row_with;
 use crate::surface::WarpedPhoto;
 use cv_core::{Cancelled, Image, Progress, Stage};
@@ -16,7 +15,7 @@ use fearless_simd::dispatch;
 
 type Pixel = [f32; 4];
 
-/// A dense rectangle of pixels whose top-left corner lies at `(left, top)` of its level of the canvas.
+/// A rectangle of a pyramid level with its top-left corner at `(left, top)` of that level of the canvas.
 struct Level {
     left: usize,
     top: usize,
@@ -35,7 +34,7 @@ impl Level {
     }
 }
 
-/// Multi-band blending with transitions of a 25th of a photograph in either direction.
+/// Multi-band blending with transitions of 1/25 of a photograph in either direction.
 pub(crate) struct Multiband;
 
 impl<T: Channel> Blender<T> for Multiband {
@@ -52,7 +51,7 @@ impl<T: Channel> Blender<T> for Multiband {
     }
 }
 
-/// The photographs joined with so many bands above the residual, at least one; black where no label names a photograph.
+/// Blends the photographs with `bands` Laplacian bands above the residual, at least one; black without a label.
 fn join<T: Channel>(
     photos: &[Option<WarpedPhoto<T>>],
     labels: &Image<u16, 1>,
@@ -111,19 +110,19 @@ fn join<T: Channel>(
     Ok(image)
 }
 
-/// The canvas at half its size as a Laplacian pyramid of weighted sums.
+/// Laplacian pyramid of weighted sums, starting at half resolution of the canvas.
 struct Pyramid {
     levels: Vec<Level>,
 }
 
 impl Pyramid {
-    /// For a canvas of this size (before it is halved) and `bands` bands above the residual, that of the full size included.
+    /// Creates the pyramid of a canvas of this (full) size with `bands` bands above the residual, including that of full resolution.
     fn new(width: usize, height: usize, bands: usize) -> Self {
         let levels = (1..=bands).map(|l| Level::new(0, 0, width.div_ceil(1 << l), height.div_ceil(1 << l))).collect();
         Self { levels }
     }
 
-    /// Adds a photograph at half its size.
+    /// Adds a photograph at half resolution.
     fn add(&mut self, half: &Level, stage: &Stage<'_>) -> Result<(), Cancelled> {
         let Some((last, bands)) = self.levels.split_last_mut() else { return Ok(()) };
         let mut smaller: Option<Level> = None;
@@ -136,7 +135,7 @@ impl Pyramid {
         add_band(last, smaller.as_ref().unwrap_or(half), None, stage)
     }
 
-    /// The blended canvas at half its size.
+    /// Normalizes and collapses the pyramid to the blended canvas at half resolution.
     fn collapse(mut self, stage: &Stage<'_>) -> Result<Level, Cancelled> {
         let simd = fearless_simd::Level::new();
         for level in &mut self.levels {
@@ -147,7 +146,7 @@ impl Pyramid {
                 || (),
                 |(), _, row| {
                     for p in row {
-                        // A thousandth of a pixel's weight lies beyond every photograph's blending range.
+                        // Weights below 1/1000 are outside every blending range.
                         let scale = if p[3] > 1e-3 { 1.0 / p[3] } else { 0.0 };
                         *p = [p[0] * scale, p[1] * scale, p[2] * scale, 0.0];
                     }
@@ -170,7 +169,7 @@ impl Pyramid {
     }
 }
 
-/// Burt's kernel 1 4 6 4 1.
+/// Applies Burt's binomial kernel 1 4 6 4 1.
 #[inline(always)]
 fn kernel(p: [Pixel; 5]) -> Pixel {
     let mut sum = [0.0; 4];
@@ -180,7 +179,7 @@ fn kernel(p: [Pixel; 5]) -> Pixel {
     sum
 }
 
-/// A photograph at half its size with the weights of its label: blurred, every second pixel of every second row. Edges are repeated. Exact, in integers.
+/// Computes the first pyramid level of a photograph and of the indicator of its label, with replicated borders; exact in integers.
 fn halve_photo<T: Channel>(
     photo: &WarpedPhoto<T>,
     labels: &Image<u16, 1>,
@@ -210,7 +209,7 @@ fn halve_photo<T: Channel>(
     Ok(half)
 }
 
-/// Sixteen times the blurred column.
+/// Vertical pass of the binomial filter, scaled by 16.
 #[inline(always)]
 fn down_the_columns<T: Copy, S: Sum>(rows: [&[T]; 5], out: &mut [S], value: impl Fn(T) -> S) {
     let n = out.len();
@@ -220,7 +219,7 @@ fn down_the_columns<T: Copy, S: Sum>(rows: [&[T]; 5], out: &mut [S], value: impl
     }
 }
 
-/// Every second pixel of a row of sixteen times the colors and weights, blurred; 256 times white is the most a sum comes to.
+/// Horizontal pass of the binomial filter and decimation by two; sums are at most 256 times white.
 #[inline(always)]
 fn along_the_row<S: Sum>(colors: &[[S; 4]], weights: &[u16], out: &mut [Pixel]) {
     let last = colors.len() - 1;
@@ -246,7 +245,7 @@ fn blurred<S: Sum>(colors: &[[S; 4]], weights: &[u16], k: [usize; 5]) -> Pixel {
     pixel
 }
 
-/// The next level: blurred, every second pixel of every second row. Edges are repeated.
+/// Computes the next pyramid level: binomial filter and decimation by two, with replicated borders.
 fn halve(level: &Level, stage: &Stage<'_>) -> Result<Level, Cancelled> {
     let (w, h) = (level.width, level.height);
     let mut half = Level::new(level.left / 2, level.top / 2, w.div_ceil(2), h.div_ceil(2));
@@ -283,19 +282,19 @@ fn halved_row(rows: [&[f32]; 5], column: &mut [Pixel], out: &mut [Pixel]) {
     }
 }
 
-/// Pixels `left` to `left + width` of row `y` of the level of the canvas twice as large, in the buffer.
+/// Upsamples pixels `left` to `left + width` of row `y` of the next finer level into the buffer.
 #[inline(always)]
 fn enlarged_row<'b>(small: &Level, left: usize, y: usize, width: usize, buffer: &'b mut Vec<Pixel>) -> &'b [Pixel] {
     let (w, h) = (small.width, small.height);
     let (y, left) = (y - 2 * small.top, left - 2 * small.left);
-    // The columns that are needed, one more on either side; those beyond the border repeat it.
+    // Required columns with one more on either side, replicated at the border.
     let (first, last) = (left / 2, (left + width).div_ceil(2));
     let columns = last + 2 - first;
     buffer.clear();
     buffer.resize(columns + 2 * (last - first), [0.0; 4]);
     let (column, up) = buffer.split_at_mut(columns);
     let line = |y: usize| small.row(y.min(h - 1)).as_flattened();
-    // Of the small level: where the buffer's inner part begins and ends.
+    // Range of the coarse level that is copied.
     let (from, to) = (first.saturating_sub(1), (last + 1).min(w));
     let inner = &mut column[from + 1 - first..][..to - from];
     let part = 4 * from..4 * to;

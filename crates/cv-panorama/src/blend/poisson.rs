@@ -1,26 +1,24 @@
 //! Gradient-domain blending (Pérez, Gangnet & Blake 2003), solved by multigrid.
 //!
-//! The picture's gradients are those of the photograph each pixel is from; across a seam, the mean of the two photographs' gradients there. What is solved
-//! for is the correction to the hard-seamed picture: it jumps by the mismatch at the seams and is as smooth as can be elsewhere. Nothing is asked of it
-//! at the border of the picture (Neumann), so nothing bleeds in from there; its mean is zero, so the colors stay where they are on average.
+//! The guidance field is the gradient of the labeled photograph; across a seam, the mean gradient of the two photographs. The unknown is the correction to the
+//! composite with hard seams, which compensates the step at the seams and is harmonic elsewhere, with Neumann conditions at the image border and zero mean.
 
+use crate::bit_depth::Channel;
 use crate::blend::hard_seams::copy;
 use crate::blend::{Blender, Composition, NO_PHOTO};
-use crate::depth::Channel;
-use crate::rows::{asks, for_each_row};
+use crate::rows::{for_each_row, is_check_due};
 use cv_core::{Cancelled, Image, Progress, Stage};
 use rayon::prelude::*;
 
 type Pixel = [f32; 4];
 
-/// Weight of the screening term, which pulls the correction toward zero, relative to a pixel's own edges. It is felt over 1/√λ = 1000 pixels:
-/// differences that would drift through a long panorama fade out instead.
+/// Weight λ of the screening term, which pulls the correction toward zero: it decays over 1/√λ = 1000 pixels, which limits drift in long panoramas.
 const SCREEN: f32 = 1e-6;
 /// Damping of the Jacobi smoother, best for the five-point Laplacian (Trottenberg, Multigrid, §2.1).
 const OMEGA: f32 = 0.8;
 /// Smoothing sweeps before and after each coarse correction.
 const SWEEPS: usize = 2;
-/// Cycles on the full grid, after the start from coarse to fine. Each leaves about a seventh of the error.
+/// V-cycles on the full grid after the full multigrid start. Each reduces the error by a factor of about seven.
 const CYCLES: usize = 4;
 
 /// Gradient-domain blending.
@@ -37,7 +35,7 @@ impl<T: Channel> Blender<T> for Poisson {
             stage.add(CYCLES + 1)?;
             return Ok(image);
         }
-        // Down to a handful of cells, which a few sweeps solve.
+        // Coarsened to a few cells, which a few sweeps solve.
         while let Some(last) = grids.last()
             && last.width.max(last.height) > 2
         {
@@ -46,7 +44,7 @@ impl<T: Channel> Blender<T> for Poisson {
         }
         solve(&mut grids, &stage)?;
         let (w, correction, labels) = (composition.labels.width(), &grids[0].value, composition.labels);
-        // Interpolation between levels lets the mean drift, and the screening is far too weak to bring it back.
+        // Interpolation between levels does not preserve the mean, and the screening is too weak to restore it.
         let rows: Vec<[f64; 4]> = correction
             .par_chunks(w.max(1))
             .zip(labels.as_slice().par_chunks(w.max(1)))
@@ -73,8 +71,8 @@ impl<T: Channel> Blender<T> for Poisson {
     }
 }
 
-/// Full multigrid on `grids`, the finest first (Trottenberg, Multigrid, §2.6): from coarse to fine, restricted right sides, then one cycle on
-/// every level from the interpolated coarser solution, several on the finest.
+/// Full multigrid on `grids`, finest first (Trottenberg, Multigrid, §2.6): restricted right-hand sides, then from coarse to fine one V-cycle on each level
+/// from the interpolated coarser solution, several on the finest.
 fn solve(grids: &mut [Grid], stage: &Stage<'_>) -> Result<(), Cancelled> {
     for level in 1..grids.len() {
         let (fine, coarse) = grids.split_at_mut(level);
@@ -94,7 +92,7 @@ fn solve(grids: &mut [Grid], stage: &Stage<'_>) -> Result<(), Cancelled> {
     Ok(())
 }
 
-/// One level: unknowns, right side, and the weights of the edges to the right and below (zero where there is none).
+/// One level: unknowns, right-hand side, and the weights of the edges to the right and below (zero where there is none).
 struct Grid {
     width: usize,
     height: usize,
@@ -121,7 +119,7 @@ impl Grid {
             p.color(x, y).map(|c| c.map(T::to_f32))
         };
         for y in 0..h {
-            if asks(y, w) {
+            if is_check_due(y, w) {
                 stage.check()?;
             }
             for x in 0..w {
@@ -143,7 +141,7 @@ impl Grid {
                     let (Some(p), Some(q)) = (color(own, x, y), color(other, nx, ny)) else { continue };
                     let (p2, q2) = (color(other, x, y), color(own, nx, ny));
                     for c in 0..3 {
-                        // The photographs' own steps over this edge; nothing where neither reaches over it.
+                        // Mean gradient of the photographs that cover both pixels; zero where none does.
                         let steps = [q2.map(|q2| p[c] - q2[c]), p2.map(|p2| p2[c] - q[c])];
                         let known = steps.iter().flatten().count().max(1) as f32;
                         let step = steps.iter().flatten().sum::<f32>() / known;
@@ -157,13 +155,13 @@ impl Grid {
         Ok(grid)
     }
 
-    /// Half the size. An edge between two cells is half the sum of the fine edges between them: their number over the doubled distance.
+    /// Coarsens to half resolution. The weight of an edge between two cells is half the sum of the fine edges between them (number over doubled distance).
     fn coarser(&self, stage: &Stage<'_>) -> Result<Self, Cancelled> {
         let (w, h) = (self.width.div_ceil(2), self.height.div_ceil(2));
-        // A cell stands for four pixels.
+        // A cell represents four pixels.
         let mut grid = Self::empty(w, h, 4.0 * self.screen);
         for y in 0..self.height {
-            if asks(y, self.width) {
+            if is_check_due(y, self.width) {
                 stage.check()?;
             }
             for x in 0..self.width {
@@ -179,7 +177,7 @@ impl Grid {
         Ok(grid)
     }
 
-    /// Sums of 2 × 2 blocks.
+    /// Restricts by sums of 2 × 2 blocks.
     fn restrict(&self, fine: &[Pixel], stage: &Stage<'_>) -> Result<Vec<Pixel>, Cancelled> {
         let (w, h) = (self.width.div_ceil(2), self.height.div_ceil(2));
         let mut coarse = vec![[0.0; 4]; w * h];
@@ -196,7 +194,7 @@ impl Grid {
         Ok(coarse)
     }
 
-    /// What `f` gives for every pixel from its index, the sum of its edges' weights and the weighted sum of its neighbors.
+    /// Evaluates `f` at every pixel with its index, the sum of its edge weights and the weighted sum of its neighbors.
     fn stencil(
         &self,
         stage: &Stage<'_>,
@@ -233,11 +231,11 @@ impl Grid {
         Ok(out)
     }
 
-    /// One sweep of damped Jacobi.
+    /// Performs one sweep of damped Jacobi.
     fn smooth(&mut self, stage: &Stage<'_>) -> Result<(), Cancelled> {
         self.value = self.stencil(stage, |i, total, sum| {
             let (v, b) = (self.value[i], self.right_side[i]);
-            // A pixel without edges has nothing to correct.
+            // Isolated pixels are not corrected.
             if total <= self.screen {
                 return [0.0; 4];
             }
@@ -256,7 +254,7 @@ impl Grid {
         })
     }
 
-    /// Adds the coarser grid's values, interpolated between the middles of its cells that are part of the picture.
+    /// Adds the coarse correction, interpolated between the centers of its cells inside the image.
     fn add_interpolated(&mut self, coarse: &Self, stage: &Stage<'_>) -> Result<(), Cancelled> {
         let w = self.width;
         let inside: Vec<f32> = (0..coarse.value.len()).map(|i| if coarse.has_edges(i) { 1.0 } else { 0.0 }).collect();
@@ -299,14 +297,14 @@ impl Grid {
     }
 }
 
-/// One V-cycle on the first of `grids`.
+/// Performs one V-cycle on the first of `grids`.
 fn cycle(grids: &mut [Grid], stage: &Stage<'_>) -> Result<(), Cancelled> {
     let Some((fine, coarser)) = grids.split_first_mut() else { return Ok(()) };
     for _ in 0..SWEEPS {
         fine.smooth(stage)?;
     }
     if let Some(coarse) = coarser.first_mut() {
-        // The right side of the coarse start is not needed any more once a cycle comes by.
+        // The right-hand side of the full multigrid start is no longer needed.
         coarse.right_side = fine.restrict(&fine.residual(stage)?, stage)?;
         coarse.value.fill([0.0; 4]);
         cycle(coarser, stage)?;

@@ -1,12 +1,12 @@
 //! Registrations as projects of Hugin and Panorama Tools (`.pto`).
 //!
-//! A photograph is a line `i`: size `w h`, projection `f0` (a rectilinear lens), angle across `v`, and `r p y`, its roll (clockwise), pitch (up) and yaw (to the right) in degrees, so that the rotation from
-//! the world to the camera is `Rz(−r) Rx(−p) Ry(−y)`. Its lens maps radii, in halves of the shorter side, by `r_photo = r (a r³ + b r² + c r + 1 − a − b − c)` where `r` is that of a pinhole of the angle `v`; `d e`
-//! are the principal point's distance from the middle, in pixels (<https://hugin.sourceforge.io/docs/manual/Image_positioning_model.html>, <https://hugin.sourceforge.io/docs/manual/Lens_correction_model.html>). A
-//! line `c` is a match of two photographs: `n x y` and `N X Y`, pixel centers at integers as with us. The line `p` is the canvas. Hugin's `nona` (2022.0) draws photographs where we do, to a tenth
-//! of a pixel in the median; equirectangular canvases of odd width half a pixel aside.
+//! An `i` line is a photograph: size `w h`, projection `f0` (rectilinear), horizontal field of view `v`, and roll `r` (clockwise), pitch `p` (up) and yaw `y` (right) in degrees: the world-to-camera rotation
+//! is `Rz(−r) Rx(−p) Ry(−y)`. The distortion maps radii, in units of half the shorter side, by `r_photo = r (a r³ + b r² + c r + 1 − a − b − c)` with `r` that of a pinhole of field of view `v`; `d e` is the offset
+//! of the principal point from the image center in pixels (<https://hugin.sourceforge.io/docs/manual/Image_positioning_model.html>, <https://hugin.sourceforge.io/docs/manual/Lens_correction_model.html>). A `c` line
+//! is a match: `n x y` and `N X Y`, with pixel centers at integers as here. The `p` line is the canvas. Hugin's `nona` (2022.0) agrees to a median of 0.1 px; for equirectangular canvases of odd width it
+//! is offset by half a pixel.
 //!
-//! `r (1 + k1 r²)` is `b` alone, with another focal length, and comes back exactly. All other lenses are fitted over the photograph by least squares, and [`Pto::lens_error_px`] says how far off that is.
+//! `r (1 + k1 r²)` is exactly representable (`b` with another focal length). Other distortions are fitted over the photograph by least squares; [`Pto::lens_error_px`] is the maximum residual.
 
 use super::{Photograph, Registration, RegistrationError};
 use crate::align::{AlignedPair, CameraMotion, View};
@@ -17,26 +17,26 @@ use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 use std::fmt::Write;
 
-/// A registration as text of Hugin, or read from it.
+/// A registration converted to or from Hugin's format.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Pto<T> {
     /// The text, or the registration.
     pub content: T,
-    /// How far the lens that was written or read is off the other at the most, in pixels, of all photographs.
+    /// Maximum residual of the distortion model conversion over all photographs, in pixels.
     pub lens_error_px: f64,
 }
 
-/// Why a registration cannot be written for Hugin, or read.
+/// Why a registration cannot be converted to or from Hugin's format.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum PtoError {
-    /// The format has rotations; a flat scene has homographies.
+    /// The alignment has homographies; the format supports rotations only.
     #[error("the scene is flat, and a .pto file has rotations only")]
     Flat,
     /// There are no photographs.
     #[error("there is no line i, of a photograph")]
     NoPhotographs,
-    /// A number is missing, is none, or refers to one that is not there.
+    /// A number is missing, malformed, or an invalid reference.
     #[error("line {line} has no number {key}")]
     Number {
         /// Counted from 1.
@@ -44,7 +44,7 @@ pub enum PtoError {
         /// The letter.
         key: &'static str,
     },
-    /// Something that a registration cannot hold.
+    /// An unsupported value.
     #[error("line {line} has {key} = {value}; it must be {range}")]
     Unsupported {
         /// Counted from 1.
@@ -53,41 +53,41 @@ pub enum PtoError {
         key: &'static str,
         /// Its value.
         value: f64,
-        /// What it may be.
+        /// What is supported.
         range: &'static str,
     },
-    /// What is there makes no registration.
+    /// The content is not a valid registration.
     #[error(transparent)]
     Registration(#[from] RegistrationError),
 }
 
-/// What the format knows of a lens.
+/// Intrinsics in the format's parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Lens {
-    /// Focal length of the pinhole whose angle is `v`, in pixels.
+    /// Focal length of the pinhole of field of view `v`, in pixels.
     focal: f64,
     a: f64,
     b: f64,
     c: f64,
-    /// Principal point, from the middle of the photograph.
+    /// Offset of the principal point from the image center, in pixels.
     shift: [f64; 2],
     /// Half of the shorter side.
     unit: f64,
 }
 
-/// Places along each side of a photograph at which lenses are compared.
+/// Grid points per side of a photograph at which distortion models are compared.
 const GRID: usize = 16;
 
-/// A grid of pixels, corners included.
+/// Returns a grid of pixels that includes the corners.
 fn grid(width: usize, height: usize) -> impl Iterator<Item = Point2<f64>> {
     let at = |i: usize, size: usize| (size as f64 - 1.0) * i as f64 / GRID as f64;
     (0..=GRID).flat_map(move |y| (0..=GRID).map(move |x| Point2::new(at(x, width), at(y, height))))
 }
 
-/// Coefficients of `Σ coefficient_k · r^powers[k]` nearest to the samples `(r, value)`; `None` where they determine none.
+/// Fits `Σ coefficient_k · r^powers[k]` to the samples `(r, value)` by least squares; `None` where the system is singular.
 fn fitted(samples: &[(f64, f64)], powers: &[i32]) -> Option<Vec<f64>> {
     let largest = samples.iter().map(|s| s.0).fold(0.0, f64::max);
-    // Of radii up to 1, or the powers differ by orders of magnitude.
+    // Radii are normalized to 1 for conditioning.
     let rows = DMatrix::from_fn(samples.len(), powers.len(), |i, k| (samples[i].0 / largest).powi(powers[k]));
     let values = DVector::from_iterator(samples.len(), samples.iter().map(|s| s.1));
     let found = (rows.transpose() * &rows).cholesky()?.solve(&(rows.transpose() * values));
@@ -95,7 +95,7 @@ fn fitted(samples: &[(f64, f64)], powers: &[i32]) -> Option<Vec<f64>> {
     scaled.iter().all(|v| v.is_finite()).then_some(scaled)
 }
 
-/// The middle of pixels along a side.
+/// Returns the center coordinate of a side.
 fn middle(side: usize) -> f64 {
     0.5 * (side as f64 - 1.0)
 }
@@ -118,7 +118,7 @@ impl Lens {
             }
         };
         let Some(&[e1, e2, e3, e4]) = coefficients.as_deref() else { return plain };
-        // By definition the unit radius stays: where ρ is seen there, is the focal length. Bisection of what grows.
+        // The unit radius is a fixed point of the format's polynomial, which determines the focal length. Bisection of a monotonic function.
         let photo = |rho: f64| rho * (e1 + rho * (e2 + rho * (e3 + rho * e4)));
         let (mut low, mut high) = (0.0, 4.0 * unit / camera.fx);
         if photo(high) < unit && photo(0.5 * high) < unit {
@@ -137,13 +137,13 @@ impl Lens {
         Self { focal, a, b, c, ..plain }
     }
 
-    /// Radius on the photograph, in pixels, of what a pinhole of focal length 1 sees at a distance from its axis.
+    /// Distorts a radius of normalized coordinates to pixels.
     fn radius(&self, rho: f64) -> f64 {
         let r = self.focal * rho / self.unit;
         self.unit * r * (1.0 - self.a - self.b - self.c + r * (self.c + r * (self.b + r * self.a)))
     }
 
-    /// The camera with a lens of ours.
+    /// Converts to a [`Camera`].
     fn camera(&self, width: usize, height: usize) -> Option<Camera> {
         let pinhole = |focal: f64| {
             let [dx, dy] = self.shift;
@@ -158,7 +158,7 @@ impl Lens {
             let k1 = b * ratio * ratio / (1.0 - b);
             return Some(Camera { distortion: Distortion::simple_radial(k1), ..pinhole(focal * (1.0 - b)) });
         }
-        // Over the photograph: up to where its corner is seen, or a little less where the polynomial does not reach it.
+        // Over the photograph: up to its corner, or less where the polynomial is not monotonic up to there.
         let corner = 0.5 * (width as f64).hypot(height as f64) + self.shift[0].hypot(self.shift[1]);
         let rho = |i: usize| corner / focal * i as f64 / 64.0;
         let samples: Vec<_> = (1..=64).map(|i| (rho(i), self.radius(rho(i)))).collect();
@@ -167,7 +167,7 @@ impl Lens {
         Some(Camera { distortion, ..pinhole(e1) })
     }
 
-    /// How far apart the two show the same, at the most, in pixels.
+    /// Computes the maximum distance of the two projections in pixels.
     fn error(&self, camera: &Camera) -> f64 {
         let principal = Point2::new(middle(camera.width) + self.shift[0], middle(camera.height) + self.shift[1]);
         let off = |p: Point2<f64>| {
@@ -180,7 +180,7 @@ impl Lens {
     }
 }
 
-/// Roll, pitch and yaw of a rotation from the world to a camera, in degrees.
+/// Returns roll, pitch and yaw, in degrees, of a world-to-camera rotation.
 fn angles(from_world: &Matrix3<f64>) -> [f64; 3] {
     let ahead = from_world.row(2).transpose();
     let (yaw, pitch) = (ahead.x.atan2(ahead.z), (-ahead.y).atan2(ahead.x.hypot(ahead.z)));
@@ -188,7 +188,7 @@ fn angles(from_world: &Matrix3<f64>) -> [f64; 3] {
     [-rest[(1, 0)].atan2(rest[(0, 0)]), pitch, yaw].map(f64::to_degrees)
 }
 
-/// The rotation from the world to a camera of roll, pitch and yaw.
+/// Returns the world-to-camera rotation of roll, pitch and yaw.
 fn rotation(roll: f64, pitch: f64, yaw: f64) -> Matrix3<f64> {
     let turned = Rotation3::from_axis_angle(&Vector3::z_axis(), -roll)
         * Rotation3::from_axis_angle(&Vector3::x_axis(), -pitch)
@@ -196,7 +196,7 @@ fn rotation(roll: f64, pitch: f64, yaw: f64) -> Matrix3<f64> {
     turned.into_inner()
 }
 
-/// The canvas as a line `p`: one that lies evenly around the middle of the surface, cut to ours.
+/// Writes the canvas as a `p` line: symmetric around the surface center, cropped to ours.
 fn canvas_line(canvas: &Canvas, (width, height): (usize, usize)) -> String {
     let number = match canvas.projection {
         Projection::Auto | Projection::Plane => "f0",
@@ -208,7 +208,7 @@ fn canvas_line(canvas: &Canvas, (width, height): (usize, usize)) -> String {
     };
     // `panini_general` at a compression of 100 is d = 1; `panini` (12) has other heights.
     let more = if canvas.projection == Projection::Panini { " P\"100 0 0\"" } else { "" };
-    // Pixel i of a side of n lies at i − (n − 1) / 2 from the middle: n odd or even, so that ours lie at whole ones.
+    // Pixel i of a side of n has coordinate i − (n − 1) / 2: the parity of n is chosen so that ours are at integers.
     let side = |origin: f64, size: usize| {
         let reach = (origin - 0.5).abs().max((origin + size as f64 - 0.5).abs());
         let n = (2.0 * reach - 1e-6).ceil();
@@ -229,9 +229,9 @@ fn canvas_line(canvas: &Canvas, (width, height): (usize, usize)) -> String {
 }
 
 impl Registration {
-    /// The photographs that are used as a project of Hugin's, on a canvas of a size that was drawn from them.
+    /// Converts the registered photographs to a Hugin project with the given canvas.
     ///
-    /// Photographs that are not used are left out, and light is: Hugin finds it anew. Quotation marks and line ends in names become `_`.
+    /// Photographs that are not registered are omitted, as are photometric parameters. Quotation marks and line ends in names become `_`.
     ///
     /// # Errors
     /// [`PtoError::Flat`].
@@ -261,7 +261,7 @@ impl Registration {
                 "i w{w} h{h} f0 v{v} Ra0 Rb0 Rc0 Rd0 Re0 Eev0 Er1 Eb1 r{r} p{p} y{y} TrX0 TrY0 TrZ0 j0 a{a} b{b} c{c} d{d} e{e} g0 t0 Va1 Vb0 Vc0 Vd0 Vx0 Vy0 Vm5 n\"{name}\""
             );
         }
-        // Nothing is left to be optimized.
+        // No variables to be optimized.
         text.push_str("\nv\n\n# control points\n");
         for pair in &self.pairs {
             let (Some(n), Some(m)) = (numbers[pair.a], numbers[pair.b]) else { continue };
@@ -272,9 +272,9 @@ impl Registration {
         Ok(Pto { content: text, lens_error_px })
     }
 
-    /// The photographs and matches of a project of Hugin's or Panorama Tools'.
+    /// Reads the photographs and matches of a project of Hugin or Panorama Tools.
     ///
-    /// Of rectilinear photographs (`f0`) that were taken from one place, without shear; crops, light, masks and the canvas are not read.
+    /// Supports rectilinear photographs (`f0`) without translation or shear; crops, photometric parameters, masks and the canvas are ignored.
     ///
     /// # Errors
     /// [`PtoError`].
@@ -307,7 +307,7 @@ impl Registration {
         Ok(Pto { content: made, lens_error_px })
     }
 
-    /// Adds a match to its pair, of which `pairs` knows the place.
+    /// Adds a match to its pair; `pairs` maps photographs to the index of the pair.
     fn add_match(&mut self, line: &Line<'_>, pairs: &mut BTreeMap<(usize, usize), usize>) -> Result<(), PtoError> {
         let number = |key| line.number(key, &[]);
         let index = |key| match number(key)? {
@@ -319,7 +319,7 @@ impl Registration {
         if a > b {
             (a, b, m) = (b, a, Correspondence { a: m.b, b: m.a });
         }
-        // A line across one photograph tells of the horizon, no overlap.
+        // Lines within one photograph (horizontal and vertical guides) are not matches.
         if a != b {
             let place = *pairs.entry((a, b)).or_insert_with(|| {
                 self.pairs.push(AlignedPair { a, b, inliers: Vec::new(), matches: Vec::new(), rms_px: 0.0 });
@@ -330,7 +330,7 @@ impl Registration {
         Ok(())
     }
 
-    /// How far matches are off, both ways.
+    /// Computes the transfer errors of the matches in both directions.
     fn measure(&mut self) {
         let views: Vec<Option<View>> = self.photographs.iter().map(|p| p.view.ok()).collect();
         let rms = |errors: &[f64]| (errors.iter().map(|e| e * e).sum::<f64>() / errors.len().max(1) as f64).sqrt();
@@ -349,7 +349,7 @@ impl Registration {
     }
 }
 
-/// A line of the file: its first word, and the others.
+/// A line of the file: its first word, and the other words.
 struct Line<'a> {
     number: usize,
     kind: &'a str,
@@ -361,7 +361,7 @@ impl<'a> Line<'a> {
         let mut words = Vec::new();
         let mut rest = text.trim();
         while !rest.is_empty() {
-            // Blanks within quotation marks belong to the word.
+            // Quoted words may contain blanks.
             let mut quoted = false;
             let end = rest.find(|c: char| {
                 quoted ^= c == '"';
@@ -376,13 +376,13 @@ impl<'a> Line<'a> {
         Some(Self { number, kind, words })
     }
 
-    /// What stands behind a letter.
+    /// Returns the value of a key.
     fn value(&self, key: &str) -> Option<&'a str> {
         let is_value = |rest: &&str| rest.starts_with(|c: char| c.is_ascii_digit() || "+-.=\"".contains(c));
         self.words.iter().find_map(|word| word.strip_prefix(key).filter(is_value))
     }
 
-    /// The number behind a letter: `=3` stands for that of photograph 3.
+    /// Returns the number of a key; `=3` refers to that of photograph 3.
     fn number(&self, key: &'static str, photographs: &[&Self]) -> Result<f64, PtoError> {
         let missing = || PtoError::Number { line: self.number, key };
         let mut value = self.value(key).ok_or_else(missing)?;
@@ -393,7 +393,7 @@ impl<'a> Line<'a> {
         value.parse().ok().filter(|v: &f64| v.is_finite()).ok_or_else(missing)
     }
 
-    /// The photograph of a line `i`, and the error of its lens in pixels.
+    /// Parses an `i` line; also returns the residual of the distortion model conversion in pixels.
     fn photograph(&self, photographs: &[&Self]) -> Result<(Photograph, f64), PtoError> {
         let number = |key| self.number(key, photographs);
         let or_zero = |key| if self.value(key).is_some() { number(key) } else { Ok(0.0) };

@@ -1,31 +1,32 @@
-//! Alpha expansion (Boykov, Veksler & Zabih 2001): every label in turn takes over the pixels that lower the total cost, by a minimum cut, until none gains.
+//! Alpha expansion (Boykov, Veksler & Zabih 2001): every label in turn is expanded by a minimum cut, until the energy no longer decreases.
 
 use crate::blend::NO_PHOTO;
-use crate::rows::{asks, for_each_row};
+use crate::rows::{for_each_row, is_check_due};
 use crate::surface::{Bounds, WarpedPhoto};
 use cv_core::{Cancelled, Image, Stage};
 use cv_imgproc::GridCut;
 use rayon::prelude::*;
 
-/// Cost of every step of a seam: between equals the shorter.
-const STEP: i32 = 4 * 3;
-/// A labeling problem: what each label costs at a pixel, and what a seam costs there.
+/// Smoothness cost per unit of seam length.
+const LENGTH_COST: i32 = 4 * 3;
+
+/// The energy of a labeling: data term and smoothness term.
 pub(super) struct Labeling<'a, U, D, F> {
-    /// The photograph of each label, which limits where it may be taken.
+    /// The photograph of each label, which limits where the label is allowed.
     pub(super) photos: &'a [Option<&'a WarpedPhoto>],
-    /// Cost of taking pixel (x, y) from a label: `unary(label, x, y)`.
+    /// Data term `unary(label, x, y)`.
     pub(super) unary: U,
-    /// How much two labels differ at a pixel: `difference(a, b, x, y)`. A seam between two neighbors costs `STEP` and the differences at both.
+    /// Difference of two labels at a pixel, `difference(a, b, x, y)`. The smoothness term is `LENGTH_COST` plus the differences at both neighbors.
     pub(super) difference: D,
-    /// Whether a pixel may change its label.
+    /// Returns whether a pixel may change its label.
     pub(super) free: F,
 }
 
-/// Places worked on between two questions whether to go on.
-const PLACES: usize = 1 << 14;
+/// Nodes processed between two checks for cancellation.
+const NODES_PER_CHECK: usize = 1 << 14;
 
-/// Capacity that no cut can afford.
-const NEVER: i32 = 1 << 28;
+/// Infinite capacity.
+const INFINITE: i32 = 1 << 28;
 
 impl<U, D, F> Labeling<'_, U, D, F>
 where
@@ -33,10 +34,10 @@ where
     D: Fn(usize, usize, usize, usize) -> i32 + Sync,
     F: Fn(usize, usize) -> bool + Sync,
 {
-    /// Lets every label in turn take over the pixels that lower the total cost, until none gains or `rounds` are over.
+    /// Expands every label in turn until the energy no longer decreases, at most `rounds` times.
     pub(super) fn expand(&self, labels: &mut Image<u16, 1>, rounds: usize, stage: &Stage<'_>) -> Result<(), Cancelled> {
         let groups = independent_groups(self.photos);
-        // A label need not be tried again unless something changed since.
+        // A label is tried again only if a label near it changed.
         let mut stale = vec![true; self.photos.len()];
         for _ in 0..rounds {
             for group in &groups {
@@ -59,7 +60,7 @@ where
         Ok(())
     }
 
-    /// The pixels that `alpha` should take over, by index.
+    /// Returns the indices of the pixels that the optimal expansion of `alpha` relabels.
     fn expand_one(&self, labels: &Image<u16, 1>, alpha: usize, stage: &Stage<'_>) -> Result<Vec<usize>, Cancelled> {
         let (width, height) = labels.size();
         let Some(own) = self.photos[alpha] else { return Ok(Vec::new()) };
@@ -69,10 +70,10 @@ where
         let names = labels.as_slice();
         let label_at = |x: usize, y: usize| names[y * width + x];
         let differ = &self.difference;
-        // A pixel may switch where it is free, alpha reaches it, and it shows something else.
+        // Nodes: free pixels of other labels that alpha covers.
         let mut places: Vec<[u32; 2]> = Vec::new();
         for y in b.top..b.bottom {
-            if asks(y, b.width()) {
+            if is_check_due(y, b.width()) {
                 stage.check()?;
             }
             for x in b.left..b.right {
@@ -86,18 +87,18 @@ where
             return Ok(Vec::new());
         }
         let place = |i: usize| (places[i][0] as usize, places[i][1] as usize);
-        // How alpha and what is shown differ at each place: most edges run between pixels of one label and need just this.
+        // Difference of alpha and the current label at each node: all that most edges, between pixels of one label, need.
         let mut shown = vec![0; places.len()];
-        for_each_row(&mut shown, PLACES, stage, |chunk, out| {
-            for (i, out) in (chunk * PLACES..).zip(out) {
+        for_each_row(&mut shown, NODES_PER_CHECK, stage, |chunk, out| {
+            for (i, out) in (chunk * NODES_PER_CHECK..).zip(out) {
                 let (x, y) = place(i);
                 *out = differ(alpha, usize::from(label_at(x, y)), x, y);
             }
         })?;
         let mut cut = GridCut::new(&places, stage)?;
-        // Source side: keeps its label. Sink side: becomes alpha.
+        // Source side: keeps its label. Sink side: switches to alpha.
         for i in 0..places.len() {
-            if i % PLACES == 0 {
+            if i % NODES_PER_CHECK == 0 {
                 stage.check()?;
             }
             let (x, y) = place(i);
@@ -112,27 +113,31 @@ where
                 fixed(x + 1, y, right.is_some() || x + 1 == width),
                 fixed(x, y + 1, below.is_some() || y + 1 == height),
             ];
-            // A fixed neighbor is a cost of the free pixel alone.
+            // An edge to a fixed neighbor is a data term.
             for (nx, ny) in beside.into_iter().flatten().filter(|&(nx, ny)| label_at(nx, ny) != NO_PHOTO) {
                 let q = usize::from(label_at(nx, ny));
-                let keep = if p == q { 0 } else { STEP + differ(p, q, x, y) + differ(p, q, nx, ny) };
+                let keep = if p == q { 0 } else { LENGTH_COST + differ(p, q, x, y) + differ(p, q, nx, ny) };
                 let here = if p == q { shown[i] } else { differ(alpha, q, x, y) };
-                let switch = if q == alpha { 0 } else { STEP + here + differ(alpha, q, nx, ny) };
+                let switch = if q == alpha { 0 } else { LENGTH_COST + here + differ(alpha, q, nx, ny) };
                 add_signed(&mut cut, i, switch - keep);
             }
             for (j, nx, ny) in
                 [(right, x + 1, y), (below, x, y + 1)].into_iter().filter_map(|(j, x, y)| Some((j?, x, y)))
             {
                 let q = usize::from(label_at(nx, ny));
-                // Cost where both keep their labels, where only the first and where only the second becomes alpha.
+                // Energy if both keep their labels, if only the first and if only the second switches.
                 let (keep, first, second) = if p == q {
-                    let either = STEP + shown[i] + shown[j];
+                    let either = LENGTH_COST + shown[i] + shown[j];
                     (0, either, either)
                 } else {
-                    let keep = STEP + differ(p, q, x, y) + differ(p, q, nx, ny);
-                    (keep, STEP + differ(alpha, q, x, y) + shown[j], STEP + shown[i] + differ(alpha, p, nx, ny))
+                    let keep = LENGTH_COST + differ(p, q, x, y) + differ(p, q, nx, ny);
+                    (
+                        keep,
+                        LENGTH_COST + differ(alpha, q, x, y) + shown[j],
+                        LENGTH_COST + shown[i] + differ(alpha, p, nx, ny),
+                    )
                 };
-                // E(keep, keep) ≤ E(alpha, keep) + E(keep, alpha) holds for differences; at borders it is made to.
+                // Submodularity, E(keep, keep) ≤ E(alpha, keep) + E(keep, alpha), is a triangle inequality; it is enforced at borders.
                 let second = second.max(keep - first);
                 // E = keep·[both keep] + first·[first only] + second·[second only], as terminals and one arc:
                 // first's switching costs (first − keep), second's then costs −first, and splitting pays the rest.
@@ -149,13 +154,13 @@ where
     }
 }
 
-/// Whether two photographs reach a common pixel or neighboring ones, going by their bounds.
+/// Returns whether the bounds of two photographs overlap or touch.
 fn touch(photos: &[Option<&WarpedPhoto>], a: usize, b: usize) -> bool {
     let (Some(a), Some(b)) = (photos[a], photos[b]) else { return false };
     a.bounds.grown(1, usize::MAX, usize::MAX).intersection(&b.bounds).is_some()
 }
 
-/// The photographs in groups that do not touch each other: in a group, what one takes over changes nothing for the others, so that they may all be tried at once.
+/// Partitions the photographs into groups that do not touch: expansions within a group are independent and run in parallel.
 fn independent_groups(photos: &[Option<&WarpedPhoto>]) -> Vec<Vec<usize>> {
     let mut groups: Vec<Vec<usize>> = Vec::new();
     for k in 0..photos.len() {
@@ -167,9 +172,9 @@ fn independent_groups(photos: &[Option<&WarpedPhoto>]) -> Vec<Vec<usize>> {
     groups
 }
 
-/// A cost (of either sign) of switching to alpha, that is, of being on the sink's side.
+/// Adds a cost (of either sign) of switching to alpha, i.e. of the sink side.
 fn add_signed(cut: &mut GridCut, place: usize, cost: i32) {
-    cut.add_terminal(place, cost.clamp(0, NEVER), (-cost).clamp(0, NEVER));
+    cut.add_terminal(place, cost.clamp(0, INFINITE), (-cost).clamp(0, INFINITE));
 }
 
 #[cfg(test)]
@@ -217,7 +222,7 @@ mod tests {
                 for (nx, ny) in [(x + 1, y), (x, y + 1)] {
                     if nx < 3 && ny < 3 && at(x, y) != at(nx, ny) {
                         let (p, q) = (at(x, y), at(nx, ny));
-                        cost += STEP + self.difference(p, q, x, y) + self.difference(p, q, nx, ny);
+                        cost += LENGTH_COST + self.difference(p, q, x, y) + self.difference(p, q, nx, ny);
                     }
                 }
             }

@@ -1,23 +1,23 @@
-//! What a seam costs: how much two photographs differ on both of its sides.
+//! Smoothness term of the seams: the difference of two photographs on both sides.
 
 use crate::surface::WarpedPhoto;
 
-/// Cost of a seam through a pixel that only one of the two photographs shows, in the unit of [`difference`]: a difference of 15 gray levels
-/// in every channel. Such seams follow the border of a photograph.
-pub(super) const BORDER: i32 = 4 * 45;
+/// Cost of a seam through a pixel that only one of the two photographs covers, in the unit of [`difference`]: 15 gray levels in every channel.
+/// Such seams follow the border of a photograph.
+pub(super) const BORDER_COST: i32 = 4 * 45;
 
-/// How much two photographs differ at a pixel: sum over channels of the absolute difference, in quarters of a gray level, and the same of the
+/// Computes the difference of two photographs at a pixel in quarters of a gray level: the sum of absolute differences over channels plus that of the
 /// gradients of brightness.
 #[inline]
 pub(super) fn difference(a: Option<&WarpedPhoto>, b: Option<&WarpedPhoto>, x: usize, y: usize) -> i32 {
-    let (Some(a), Some(b)) = (a, b) else { return BORDER };
+    let (Some(a), Some(b)) = (a, b) else { return BORDER_COST };
     if !a.bounds.contains(x, y) || !b.bounds.contains(x, y) {
-        return BORDER;
+        return BORDER_COST;
     }
     let (first, second) = (a.pixels.as_slice().as_chunks::<4>().0, b.pixels.as_slice().as_chunks::<4>().0);
     let (across, down) = (a.bounds.width(), b.bounds.width());
     let (i, j) = ((y - a.bounds.top) * across + x - a.bounds.left, (y - b.bounds.top) * down + x - b.bounds.left);
-    let Some(d) = color_difference(first[i], second[j]) else { return BORDER };
+    let Some(d) = color_difference(first[i], second[j]) else { return BORDER_COST };
     let brightness = d[0] + d[1] + d[2];
     // The difference of gradients is the gradient of the difference.
     let gradient = |i: usize, j: usize| match color_difference(first[i], second[j]) {
@@ -34,7 +34,7 @@ pub(super) fn difference(a: Option<&WarpedPhoto>, b: Option<&WarpedPhoto>, x: us
     4 * sum
 }
 
-/// Where both photographs reach.
+/// Returns the color difference where both photographs cover the pixel.
 #[inline(always)]
 fn color_difference(p: [u8; 4], q: [u8; 4]) -> Option<[i32; 3]> {
     let of = |c: usize| i32::from(p[c]) - i32::from(q[c]);
@@ -55,8 +55,8 @@ mod tests {
         assert_eq!(difference(a, b, 5, 5), 0);
         assert_eq!(difference(a, b, 2, 3), 0);
         // Where one of the two does not reach.
-        assert_eq!(difference(a, b, 1, 5), BORDER);
-        assert_eq!(difference(a, None, 5, 5), BORDER);
+        assert_eq!(difference(a, b, 1, 5), BORDER_COST);
+        assert_eq!(difference(a, None, 5, 5), BORDER_COST);
     }
 
     #[test]

@@ -1,22 +1,22 @@
-//! Where two photographs show the same thing at different places of the preview: near things against far ones, where no deformation is smooth enough
-//! to bring both together. A seam there cuts things in two however little the colors on it differ.
+//! Residual misalignment (parallax) of two photographs on the preview, by normalized cross-correlation of patches. A seam there cuts objects in two
+//! however similar the colors are.
 
-use crate::surface::{PAD, PLACES, Piece, Preview, REACH, Template};
+use crate::surface::{PAD, Piece, Preview, SEARCH_RADIUS, SEARCH_SIDE, Template};
 use cv_core::{Cancelled, GrayF32, Stage, luma_f32};
 use rayon::prelude::*;
 
-/// Half the side of the patches compared, in preview pixels.
-const HALF: usize = 4;
-/// Preview pixels between places looked at.
-const STEP: usize = 3;
-/// Least root mean square contrast of a patch, in gray levels: below it, what is cut in two is not seen.
-const CONTRAST: f32 = 4.0;
-/// Correlation at which two patches show the same thing.
-const ALIKE: f32 = 0.85;
-/// Correlations closer than this to the best are as good: along an edge any place is, and the nearest counts.
-const AS_GOOD: f32 = 0.03;
+/// Patch radius in preview pixels.
+const PATCH_RADIUS: usize = 4;
+/// Grid spacing of the patches in preview pixels.
+const SPACING: usize = 3;
+/// Minimum root mean square contrast of a patch, in gray levels: low-texture patches are skipped.
+const MIN_CONTRAST: f32 = 4.0;
+/// Minimum correlation of corresponding patches.
+const MIN_CORRELATION: f32 = 0.85;
+/// Correlations within this of the maximum are equivalent (aperture problem along edges): the smallest displacement counts.
+const CORRELATION_TOLERANCE: f32 = 0.03;
 
-/// For every two pieces, by how many preview pixels they disagree.
+/// Misalignment maps of all pairs of pieces, in preview pixels.
 pub(crate) struct Misalignments {
     pieces: usize,
     pairs: Vec<Option<Pair>>,
@@ -31,7 +31,7 @@ struct Pair {
 }
 
 impl Misalignments {
-    /// Compares all overlapping pieces. O(overlap · reach² · patch) where they disagree, O(overlap · patch) where not.
+    /// Compares all overlapping pieces. O(overlap · search² · patch) where they are misaligned, O(overlap · patch) elsewhere.
     pub(crate) fn find(preview: &Preview, photo_of: &[usize], stage: &Stage<'_>) -> Result<Self, Cancelled> {
         let lumas: Vec<GrayF32> = preview.pieces.par_iter().map(luma).collect();
         let n = preview.pieces.len();
@@ -45,18 +45,18 @@ impl Misalignments {
         Ok(Self { pieces: n, pairs })
     }
 
-    /// By how many preview pixels two pieces disagree about a preview pixel; 0 where that is not known.
+    /// Returns the misalignment of two pieces at a preview pixel, in preview pixels; 0 where unknown.
     #[inline]
     pub(crate) fn at(&self, a: usize, b: usize, x: usize, y: usize) -> f32 {
         let (a, b) = (a.min(b), a.max(b));
         let Some(Some(p)) = self.pairs.get(a * self.pieces + b) else { return 0.0 };
         let (Some(x), Some(y)) = (x.checked_sub(p.left), y.checked_sub(p.top)) else { return 0.0 };
-        let (column, row) = (x / STEP, y / STEP);
+        let (column, row) = (x / SPACING, y / SPACING);
         if column < p.columns && row < p.rows { p.pixels[row * p.columns + column] } else { 0.0 }
     }
 }
 
-/// Brightness, NaN where the photograph does not reach.
+/// Converts a piece to luma; NaN where the photograph does not cover the pixel.
 fn luma(piece: &Piece) -> GrayF32 {
     let (w, h) = piece.warped.pixels.size();
     GrayF32::from_fn(w, h, |x, y| {
@@ -74,13 +74,13 @@ fn compare(
 ) -> Result<Option<Pair>, Cancelled> {
     let (first, second) = (preview.pieces[a].warped.bounds, preview.pieces[b].warped.bounds);
     let Some(common) = first.intersection(&second) else { return Ok(None) };
-    let (columns, rows) = (common.width() / STEP, common.height() / STEP);
+    let (columns, rows) = (common.width() / SPACING, common.height() / SPACING);
     let mut pixels = vec![0.0; columns * rows];
     pixels.par_chunks_mut(columns.max(1)).enumerate().try_for_each(|(row, out)| {
-        // A row of a few hundred places, each compared with some three hundred: milliseconds.
+        // A row takes milliseconds.
         stage.check()?;
         for (column, out) in out.iter_mut().enumerate() {
-            let (x, y) = (common.left + column * STEP + STEP / 2, common.top + row * STEP + STEP / 2);
+            let (x, y) = (common.left + column * SPACING + SPACING / 2, common.top + row * SPACING + SPACING / 2);
             let p = ((x - first.left) as isize, (y - first.top) as isize);
             let q = ((x - second.left) as isize, (y - second.top) as isize);
             *out = displacement(&lumas[a], p, &lumas[b], q);
@@ -91,10 +91,10 @@ fn compare(
     Ok(Some(Pair { left: common.left, top: common.top, columns, rows, pixels }))
 }
 
-/// Places too near a border to be compared take the worst of their neighbors: a seam along the border cuts what those show. The others stay as they are.
+/// Extrapolates to patches too close to a border (NaN): each takes the maximum of its neighbors.
 fn extend_to_borders(pixels: &mut [f32], columns: usize) {
-    // From the border to where a whole patch fits it is this many places.
-    for _ in 0..HALF.div_ceil(STEP) + 1 {
+    // Number of grid cells from the border to the first complete patch.
+    for _ in 0..PATCH_RADIUS.div_ceil(SPACING) + 1 {
         let before = pixels.to_vec();
         for (i, pixel) in pixels.iter_mut().enumerate().filter(|(_, p)| p.is_nan()) {
             let (x, y) = (i % columns, i / columns);
@@ -107,10 +107,10 @@ fn extend_to_borders(pixels: &mut [f32], columns: usize) {
     pixels.iter_mut().filter(|p| p.is_nan()).for_each(|p| *p = 0.0);
 }
 
-/// The least displacement at which the patch around `p` looks as around `q`: 0 where it is too plain, [`REACH`] where nothing looks like it, NaN where one
-/// of the two is not wholly inside its photograph.
+/// Computes the smallest displacement at which the patch around `p` matches that around `q`: 0 for low texture, [`SEARCH_RADIUS`] without a match, NaN where one
+/// of the patches is not complete.
 fn displacement(first: &GrayF32, p: (isize, isize), second: &GrayF32, q: (isize, isize)) -> f32 {
-    const SIDE: usize = 2 * HALF + 1;
+    const SIDE: usize = 2 * PATCH_RADIUS + 1;
     let mut patch = [0.0_f32; SIDE * SIDE];
     let (Some(ours), Some(theirs)) = (rows(first, p), rows(second, q)) else { return f32::NAN };
     if theirs.clone().flatten().any(|v| v.is_nan()) {
@@ -123,16 +123,16 @@ fn displacement(first: &GrayF32, p: (isize, isize), second: &GrayF32, q: (isize,
     if template.energy().is_nan() {
         return f32::NAN;
     }
-    if template.energy() < (SIDE * SIDE) as f32 * CONTRAST * CONTRAST {
+    if template.energy() < (SIDE * SIDE) as f32 * MIN_CONTRAST * MIN_CONTRAST {
         return 0.0;
     }
-    if template.score(theirs) > 1.0 - AS_GOOD {
+    if template.score(theirs) > 1.0 - CORRELATION_TOLERANCE {
         return 0.0;
     }
-    // Where the window leaves the photograph it is NaN, and so are the scores there.
-    const WIDE: usize = SIDE + 2 * REACH;
+    // NaN outside the photograph, as are the scores there.
+    const WIDE: usize = SIDE + 2 * SEARCH_RADIUS;
     let mut window = [f32::NAN; WIDE * WIDE + PAD];
-    let reach = (HALF + REACH) as isize;
+    let reach = (PATCH_RADIUS + SEARCH_RADIUS) as isize;
     let (w, h) = (second.width() as isize, second.height() as isize);
     let (left, right) = ((q.0 - reach).max(0), (q.0 + reach + 1).min(w));
     for y in (q.1 - reach).max(0)..(q.1 + reach + 1).min(h) {
@@ -143,17 +143,17 @@ fn displacement(first: &GrayF32, p: (isize, isize), second: &GrayF32, q: (isize,
     let scores = template.scores(&window);
     // `max` passes over NaN.
     let best = scores.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-    if best < ALIKE {
-        return REACH as f32;
+    if best < MIN_CORRELATION {
+        return SEARCH_RADIUS as f32;
     }
-    let off = |i: usize| i.abs_diff(REACH) as f32;
-    let distance = |i: usize| off(i % PLACES).hypot(off(i / PLACES));
-    (0..scores.len()).filter(|&i| scores[i] >= best - AS_GOOD).map(distance).fold(f32::INFINITY, f32::min)
+    let off = |i: usize| i.abs_diff(SEARCH_RADIUS) as f32;
+    let distance = |i: usize| off(i % SEARCH_SIDE).hypot(off(i / SEARCH_SIDE));
+    (0..scores.len()).filter(|&i| scores[i] >= best - CORRELATION_TOLERANCE).map(distance).fold(f32::INFINITY, f32::min)
 }
 
-/// The rows of the patch around a pixel; `None` where it is not wholly inside.
+/// Returns the rows of the patch around a pixel; `None` where it is not complete.
 fn rows(image: &GrayF32, (x, y): (isize, isize)) -> Option<impl Iterator<Item = &[f32]> + Clone> {
-    let h = HALF as isize;
+    let h = PATCH_RADIUS as isize;
     let inside = x >= h && y >= h && x + h < image.width() as isize && y + h < image.height() as isize;
     inside.then(|| (y - h..=y + h).map(move |y| &image.row(y as usize)[(x - h) as usize..=(x + h) as usize]))
 }
@@ -181,7 +181,7 @@ mod tests {
         let plain = GrayF32::from_fn(60, 60, |_, _| [100.0]);
         assert_eq!(displacement(&plain, (30, 30), &first, (30, 30)), 0.0);
         let foreign = GrayF32::from_fn(60, 60, |x, y| [255.0 * ((x * 7919 + y * 104_729) % 97) as f32 / 97.0]);
-        assert_eq!(displacement(&first, (30, 30), &foreign, (30, 30)), REACH as f32);
+        assert_eq!(displacement(&first, (30, 30), &foreign, (30, 30)), SEARCH_RADIUS as f32);
         // Along an edge nothing is known: the nearest place counts.
         let edge = GrayF32::from_fn(60, 60, |x, _| [if x < 30 { 20.0 } else { 200.0 }]);
         assert_eq!(displacement(&edge, (30, 25), &edge, (30, 33)), 0.0);

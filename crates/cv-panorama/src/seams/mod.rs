@@ -1,8 +1,8 @@
-//! Which photograph each canvas pixel is taken from: minimal cuts through the overlaps (Kwatra et al. 2003; Agarwala et al. 2004).
+//! Seam finding by graph cuts (Kwatra et al. 2003; Agarwala et al. 2004).
 //!
-//! A labeling costs, between neighbors `p` and `q` taken from photographs `a` and `b`, how much the two differ at both places, in color
-//! and in gradient: a seam runs where they show the same, around what moved. Alpha expansion finds a labeling that no single photograph can
-//! improve by taking over pixels: on a preview first, then in full size near the seams found there.
+//! A label per canvas pixel selects the photograph. The smoothness term between neighbors `p` and `q` with labels `a` and `b` is the difference of the two
+//! photographs at both pixels, in color and gradient, so that seams avoid moving objects and misalignments. The energy is minimized by alpha expansion: on a
+//! preview first, then in full resolution in a band around the seams.
 
 mod alpha_expansion;
 mod cost;
@@ -12,43 +12,40 @@ mod upsample;
 pub(crate) use upsample::upsample;
 
 use crate::blend::NO_PHOTO;
-use crate::rows::{asks, for_each_row};
+use crate::rows::{for_each_row, is_check_due};
 use crate::surface::{Bounds, Piece, Preview, WarpedPhoto};
 use alpha_expansion::Labeling;
 use cost::difference;
 use cv_core::{Cancelled, Image, Progress, Stage, named};
 use misalignment::Misalignments;
 
-/// How seams are found.
+/// Seam finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Seams {
-    /// Where the middles of two photographs are equally far (a Voronoi diagram): straight through whatever is there.
+    /// Where the centers of two photographs are equally far (a Voronoi diagram), regardless of content.
     Voronoi,
-    /// Where the photographs agree, by minimum cuts.
+    /// Where the photographs agree, by graph cuts.
     #[default]
     GraphCut,
 }
 
 named!(Seams { GraphCut = "graphcut", Voronoi = "voronoi" | "middle" });
 
-/// Cost of taking a pixel at the border of its photograph instead of at its middle. A hundredth of a visible difference, so that it decides only where
+/// Data term at the border of a photograph; 0 at its center. A hundredth of a visible difference, so that it decides only where
 /// the photographs agree.
-const BORDER_PIXEL: f32 = 4.0;
+const ECCENTRICITY_COST: f32 = 4.0;
 
-/// Cost of taking a pixel that the photograph shows clipped, where another may not: a seam around a square of 60 preview pixels of them may differ by 15 gray
-/// levels in every channel.
-const CLIPPED_PIXEL: f32 = 12.0;
-/// The same where the light itself is asked for, which another photograph knows: more than the border of a photograph costs.
-const UNKNOWN_PIXEL: f32 = 400.0;
+/// Data term of a clipped pixel: balances a seam of 15 gray levels in every channel around a square of 60 clipped preview pixels.
+const CLIPPED_COST: f32 = 12.0;
+/// Data term of a clipped pixel where radiance is computed: more than a seam along the border of a photograph.
+const CLIPPED_RADIANCE_COST: f32 = 400.0;
 
-/// Cost of a seam through a pixel where the photographs disagree by a canvas pixel more than one, beyond the difference of colors: 15 gray levels in
-/// one channel.
-const MISALIGNED: f32 = 4.0 * 15.0;
-/// Canvas pixels of misalignment, beyond the first, after which nothing looks worse and the colors decide alone: then it costs as much as the border of a
-/// photograph.
-const FARTHEST: f32 = 3.0;
+/// Smoothness term per canvas pixel of misalignment beyond the first, in addition to the color difference: 15 gray levels in one channel.
+const MISALIGNMENT_COST: f32 = 4.0 * 15.0;
+/// Misalignment beyond the first canvas pixel at which the cost is truncated: then it equals that of the border of a photograph.
+const MAX_MISALIGNMENT_PX: f32 = 3.0;
 
-/// The box around all pixels of each of `n` labels.
+/// Returns the bounding box of each of `n` labels.
 pub(crate) fn label_bounds(labels: &Image<u16, 1>, n: usize) -> Vec<Option<Bounds>> {
     let mut bounds: Vec<Option<Bounds>> = vec![None; n];
     for y in 0..labels.height() {
@@ -63,11 +60,11 @@ pub(crate) fn label_bounds(labels: &Image<u16, 1>, n: usize) -> Vec<Option<Bound
     bounds
 }
 
-/// Preview pixels on either side of the seams of the halved preview among which the preview's own are found: a cut over the whole preview takes
-/// several times as long for seams that are hardly cheaper.
-const NEAR: usize = 4;
+/// Half width, in preview pixels, of the band around the seams of the halved preview in which the seams of the preview are found: a cut over the whole
+/// preview takes several times as long for hardly less energy.
+const BAND_RADIUS: usize = 4;
 
-/// Labels on the preview: seams through it all at half its size, then near those.
+/// Finds the labels on the preview: unrestricted at half resolution, then in a band around those seams.
 pub(crate) fn on_preview(
     preview: &Preview,
     photo_of: &[usize],
@@ -75,7 +72,7 @@ pub(crate) fn on_preview(
     radiance: bool,
     progress: &dyn Progress,
 ) -> Result<Image<u16, 1>, Cancelled> {
-    let clipped = if radiance { UNKNOWN_PIXEL } else { CLIPPED_PIXEL };
+    let clipped = if radiance { CLIPPED_RADIANCE_COST } else { CLIPPED_COST };
     let mut labels = voronoi(preview);
     if seams == Seams::Voronoi {
         return Ok(labels);
@@ -86,20 +83,20 @@ pub(crate) fn on_preview(
     let pieces: Vec<Option<&WarpedPhoto>> = preview.pieces.iter().map(|p| Some(&p.warped)).collect();
     let differ = |a: usize, b: usize, x: usize, y: usize| {
         let off = preview.step as f32 * found.at(a, b, x, y) - 1.0;
-        difference(pieces[a], pieces[b], x, y) + (MISALIGNED * off.clamp(0.0, FARTHEST)) as i32
+        difference(pieces[a], pieces[b], x, y) + (MISALIGNMENT_COST * off.clamp(0.0, MAX_MISALIGNMENT_PX)) as i32
     };
     let half = preview.halved();
     let mut coarse = voronoi(&half);
-    // The worst of four pixels: their mean colors would hide a pole that the seam cuts in two.
-    let worst = |a: usize, b: usize, x: usize, y: usize| {
+    // The maximum over four pixels: their mean would hide a thin object that the seam cuts.
+    let max_difference = |a: usize, b: usize, x: usize, y: usize| {
         let four = [(0, 0), (1, 0), (0, 1), (1, 1)];
         four.into_iter().map(|(i, j)| differ(a, b, 2 * x + i, 2 * y + j)).fold(0, i32::max)
     };
-    // A pixel stands for four, a step of a seam for two.
-    let pixel = |label: usize, x: usize, y: usize| (2.0 * of_pixel(&half.pieces[label], clipped, x, y)) as i32;
+    // A pixel represents four, a unit of seam length two.
+    let pixel = |label: usize, x: usize, y: usize| (2.0 * data_term(&half.pieces[label], clipped, x, y)) as i32;
     let reach: Vec<_> = half.pieces.iter().map(|p| Some(&p.warped)).collect();
-    // The first round does nearly all: a third here and a second below leave the misfits at the seams of every set met so far as they are.
-    let labeling = Labeling { photos: &reach, unary: pixel, difference: worst, free: |_, _| true };
+    // Further rounds hardly lower the energy.
+    let labeling = Labeling { photos: &reach, unary: pixel, difference: max_difference, free: |_, _| true };
     labeling.expand(&mut coarse, 2, &stage)?;
     stage.add(1)?;
 
@@ -113,8 +110,8 @@ pub(crate) fn on_preview(
             *label = found;
         }
     }
-    let near = near_seams(&labels, NEAR, &stage)?;
-    let pixel = |label: usize, x: usize, y: usize| of_pixel(&preview.pieces[label], clipped, x, y) as i32;
+    let near = seam_band(&labels, BAND_RADIUS, &stage)?;
+    let pixel = |label: usize, x: usize, y: usize| data_term(&preview.pieces[label], clipped, x, y) as i32;
     let labeling =
         Labeling { photos: &pieces, unary: pixel, difference: differ, free: |x: usize, y: usize| near[y * width + x] };
     labeling.expand(&mut labels, 1, &stage)?;
@@ -122,7 +119,7 @@ pub(crate) fn on_preview(
     Ok(labels)
 }
 
-/// Every pixel from the photograph whose middle is nearest.
+/// Labels every pixel with the photograph whose center is nearest.
 fn voronoi(preview: &Preview) -> Image<u16, 1> {
     let (width, height) = (preview.width, preview.height);
     Image::from_fn(width, height, |x, y| {
@@ -132,11 +129,11 @@ fn voronoi(preview: &Preview) -> Image<u16, 1> {
     })
 }
 
-/// Cost of taking a pixel from a piece, and of one that it shows `clipped`.
-fn of_pixel(piece: &Piece, clipped: f32, x: usize, y: usize) -> f32 {
+/// Data term of a pixel; `clipped` is the cost of a clipped one.
+fn data_term(piece: &Piece, clipped: f32, x: usize, y: usize) -> f32 {
     let b = piece.warped.bounds;
     let i = (y - b.top) * b.width() + x - b.left;
-    BORDER_PIXEL * piece.eccentricity[i] + if piece.clipped[i] { clipped } else { 0.0 }
+    ECCENTRICITY_COST * piece.eccentricity[i] + if piece.clipped[i] { clipped } else { 0.0 }
 }
 
 fn eccentricity(piece: &Piece, x: usize, y: usize) -> f32 {
@@ -144,11 +141,11 @@ fn eccentricity(piece: &Piece, x: usize, y: usize) -> f32 {
     piece.eccentricity[(y - b.top) * b.width() + x - b.left]
 }
 
-/// Pixels on a side of the blocks that seams are moved by first where a preview pixel is larger.
+/// Side, in canvas pixels, of the blocks on which seams are refined first where a preview pixel is larger.
 const BLOCK: usize = 4;
 
-/// Moves the seams of full-size labels, which are those of a preview of pixels of `step`, to where the photographs agree in full detail: by up to two of these.
-/// Where that is far, by blocks first, and then by a block and a half.
+/// Refines seams in full resolution in a band of two preview pixels (of `step` canvas pixels) around them. Wide bands are refined on blocks first, and then
+/// in a band of a block and a half.
 pub(crate) fn refine(
     labels: &mut Image<u16, 1>,
     photos: &[Option<WarpedPhoto>],
@@ -163,7 +160,7 @@ pub(crate) fn refine(
         reach = BLOCK + BLOCK / 2;
     }
     stage.add(1)?;
-    let near = near_seams(labels, reach, &stage)?;
+    let near = seam_band(labels, reach, &stage)?;
     stage.add(1)?;
     let width = labels.width();
     let differ = |a: usize, c: usize, x: usize, y: usize| difference(pieces[a], pieces[c], x, y);
@@ -172,7 +169,7 @@ pub(crate) fn refine(
     stage.add(1)
 }
 
-/// Moves seams by up to `reach` blocks. The label of a block is that of its middle; what two photographs differ there is the most of four places.
+/// Refines seams by up to `reach` blocks. The label of a block is that of its center; the difference is the maximum over four pixels.
 fn refine_blocks(
     labels: &mut Image<u16, 1>,
     photos: &[Option<&WarpedPhoto>],
@@ -184,9 +181,9 @@ fn refine_blocks(
     // Blocks whose middles there are.
     let (across, down) = ((w + BLOCK - 1 - MIDDLE) / BLOCK, (h + BLOCK - 1 - MIDDLE) / BLOCK);
     let before = Image::from_fn(across, down, |x, y| labels.at(BLOCK * x + MIDDLE, BLOCK * y + MIDDLE));
-    let thinned: Vec<Option<WarpedPhoto>> = photos.iter().map(|photo| photo.map(thinned)).collect();
-    let reached: Vec<Option<&WarpedPhoto>> = thinned.iter().map(Option::as_ref).collect();
-    let near = near_seams(&before, reach, stage)?;
+    let subsampled: Vec<Option<WarpedPhoto>> = photos.iter().map(|photo| photo.map(subsampled)).collect();
+    let reached: Vec<Option<&WarpedPhoto>> = subsampled.iter().map(Option::as_ref).collect();
+    let near = seam_band(&before, reach, stage)?;
     let differ = |a: usize, c: usize, x: usize, y: usize| {
         let of = |x: usize, y: usize| difference(photos[a], photos[c], x, y);
         let (x, y) = (BLOCK * x, BLOCK * y);
@@ -209,8 +206,8 @@ fn refine_blocks(
     Ok(())
 }
 
-/// A photograph's pixels in the middles of blocks.
-fn thinned(photo: &WarpedPhoto) -> WarpedPhoto {
+/// Samples a photograph at the centers of the blocks.
+fn subsampled(photo: &WarpedPhoto) -> WarpedPhoto {
     let b = photo.bounds;
     // The first block whose middle is not before a column or row.
     let block = |v: usize| v.saturating_sub(BLOCK / 2).div_ceil(BLOCK);
@@ -222,8 +219,8 @@ fn thinned(photo: &WarpedPhoto) -> WarpedPhoto {
     WarpedPhoto { bounds, pixels }
 }
 
-/// True within `reach` pixels (in x and y) of a border between two labels.
-fn near_seams(labels: &Image<u16, 1>, reach: usize, stage: &Stage<'_>) -> Result<Vec<bool>, Cancelled> {
+/// Returns the mask of pixels within `reach` pixels (Chebyshev distance) of a seam.
+fn seam_band(labels: &Image<u16, 1>, reach: usize, stage: &Stage<'_>) -> Result<Vec<bool>, Cancelled> {
     let (w, h) = labels.size();
     // Along rows, then along columns: the pixels since the last seam and until the next.
     let mut near = vec![false; w * h];
@@ -245,7 +242,7 @@ fn near_seams(labels: &Image<u16, 1>, reach: usize, stage: &Stage<'_>) -> Result
     let mut since = vec![usize::MAX; w];
     let mut until: Vec<usize> = vec![0; w];
     for y in 0..h {
-        if asks(y, w) {
+        if is_check_due(y, w) {
             stage.check()?;
         }
         let (before, row) = near.split_at_mut(y * w);
@@ -279,7 +276,7 @@ mod tests {
         #[test]
         fn the_band_along_seams_is_all_within_reach_of_a_step(labels in proptest::collection::vec(0..3_u16, 63), reach in 0..4_usize) {
             let labels = Image::from_fn(9, 7, |x, y| [if labels[9 * y + x] == 2 && x < 4 { NO_PHOTO } else { labels[9 * y + x] / 2 }]);
-            let found = near_seams(&labels, reach, &stage()).unwrap();
+            let found = seam_band(&labels, reach, &stage()).unwrap();
             let step = |x: usize, y: usize| {
                 let own = labels.at(x, y)[0];
                 [(x + 1, y), (x, y + 1)].into_iter().any(|(nx, ny)| {
@@ -406,11 +403,11 @@ mod tests {
     }
 
     #[test]
-    fn thinned_photographs_reach_the_blocks_whose_middles_they_reach() {
+    fn subsampled_photographs_cover_the_blocks_whose_centers_they_cover() {
         for (left, right) in [(0, 13), (1, 14), (2, 15), (3, 16), (6, 7), (7, 9)] {
             let bounds = Bounds { left, top: left, right, bottom: right };
             let photo = drawn(bounds, |x, y| [x as u8, y as u8, 0]);
-            let small = thinned(&photo);
+            let small = subsampled(&photo);
             for (x, y) in (0..5).flat_map(|y| (0..5).map(move |x| (x, y))) {
                 assert_eq!(small.color(x, y), photo.color(BLOCK * x + 2, BLOCK * y + 2), "{left} {right} {x} {y}");
             }

@@ -1,12 +1,12 @@
-//! The labels of the preview in full size.
+//! Upsampling of the preview labels to full resolution.
 
 use crate::blend::NO_PHOTO;
 use crate::rows::for_each_row;
 use crate::surface::WarpedPhoto;
 use cv_core::{Cancelled, Image, Sample, Scaling, Stage};
 
-/// Labels of a canvas of `size`, `step` times as large as theirs: interpolated so that seams are smooth, where the photograph reaches; else another that
-/// reaches.
+/// Upsamples labels by `step` to a canvas of the given size. Bilinear votes give smooth seams; where the photograph of the winner does not cover the pixel,
+/// another that does is taken.
 pub(crate) fn upsample<T: Sample>(
     coarse: &Image<u16, 1>,
     step: usize,
@@ -19,7 +19,7 @@ pub(crate) fn upsample<T: Sample>(
     };
     let mut labels = Image::new(w, h, [NO_PHOTO]);
     let (cw, ch) = coarse.size();
-    // The preview pixel at or before a canvas pixel, and how far behind it that lies.
+    // Interpolation index and weight of a canvas coordinate on the preview.
     let place = |v: usize, n: usize| {
         let t = Scaling::coordinate(v as f64, 1.0 / step as f64).max(0.0) as f32;
         let i = (t as usize).min(n - 1);

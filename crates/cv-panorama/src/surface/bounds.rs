@@ -24,13 +24,13 @@ impl Bounds {
         self.bottom - self.top
     }
 
-    /// Whether a canvas pixel lies inside.
+    /// Returns whether a canvas pixel lies inside.
     #[inline]
     pub fn contains(&self, x: usize, y: usize) -> bool {
         x >= self.left && y >= self.top && x < self.right && y < self.bottom
     }
 
-    /// The common part; `None` where there is none.
+    /// Returns the intersection; `None` where it is empty.
     pub fn intersection(&self, other: &Self) -> Option<Self> {
         let b = Self {
             left: self.left.max(other.left),
@@ -41,7 +41,7 @@ impl Bounds {
         (b.left < b.right && b.top < b.bottom).then_some(b)
     }
 
-    /// Grown by `by` pixels to all sides, within a canvas.
+    /// Grows the rectangle by `by` pixels on all sides, clipped to a canvas.
     pub(crate) fn grown(&self, by: usize, width: usize, height: usize) -> Self {
         Self {
             left: self.left.saturating_sub(by),
@@ -51,7 +51,7 @@ impl Bounds {
         }
     }
 
-    /// Grown as far as a pyramid of so many levels above its base blends, and rounded out to its pixels on every level.
+    /// Grows the rectangle by the support of a pyramid of `levels` levels above its base, and rounds it out to whole pixels of every level.
     pub(crate) fn for_pyramid(&self, levels: usize, width: usize, height: usize) -> Self {
         let unit = 1 << levels;
         let grown = self.grown(2 * unit, width, height);

@@ -1,17 +1,17 @@
-//! Normalized cross-correlation of a small square patch with all places of a window around where it is expected.
+//! Normalized cross-correlation of a small square patch over a search window.
 
 use fearless_simd::{Level, dispatch};
 
-/// Farthest displacement looked for, in pixels of the patch.
-pub(crate) const REACH: usize = 8;
-/// Displacements along each axis.
-pub(crate) const PLACES: usize = 2 * REACH + 1;
-/// Displacements along a row are worked on side by side: as many as fill whole vectors of every instruction set.
+/// Search radius, in pixels of the patch.
+pub(crate) const SEARCH_RADIUS: usize = 8;
+/// Number of displacements along each axis.
+pub(crate) const SEARCH_SIDE: usize = 2 * SEARCH_RADIUS + 1;
+/// Displacements along a row that are computed in parallel: fills whole vectors of every instruction set.
 const LANES: usize = 24;
-/// Numbers after the last of a window, which the lanes beyond [`PLACES`] read and nobody uses.
-pub(crate) const PAD: usize = LANES - PLACES;
+/// Padding after the last sample of a window, read by the lanes beyond [`SEARCH_SIDE`] and ignored.
+pub(crate) const PAD: usize = LANES - SEARCH_SIDE;
 
-/// A patch to look for: less its mean, row by row.
+/// A template: a zero-mean patch, row-major.
 pub(crate) struct Template {
     side: usize,
     centered: Vec<f32>,
@@ -26,12 +26,12 @@ impl Template {
         Self { side, centered, energy }
     }
 
-    /// Sum of the squares about the mean.
+    /// Returns the sum of squared deviations from the mean.
     pub(crate) fn energy(&self) -> f32 {
         self.energy
     }
 
-    /// The correlation with one place, given by its rows: −1 to 1; NaN where they are.
+    /// Computes the correlation with one patch, given by its rows: −1 to 1; NaN if it contains NaN.
     pub(crate) fn score<'a>(&self, rows: impl Iterator<Item = &'a [f32]>) -> f32 {
         let (mut sum, mut squares, mut product) = (0.0_f32, 0.0_f32, 0.0_f32);
         for (ours, theirs) in self.centered.chunks_exact(self.side).zip(rows) {
@@ -44,18 +44,18 @@ impl Template {
         self.normalized(sum, squares, product)
     }
 
-    /// The correlations with all places of a window of `side + 2 REACH` on a side, followed by [`PAD`] numbers: row by row, the same as [`Self::score`] of
-    /// each.
-    pub(crate) fn scores(&self, window: &[f32]) -> [f32; PLACES * PLACES] {
+    /// Computes the correlations with all positions of a window of side `side + 2 SEARCH_RADIUS`, followed by [`PAD`] samples, row-major; equal to
+    /// [`Self::score`] of each.
+    pub(crate) fn scores(&self, window: &[f32]) -> [f32; SEARCH_SIDE * SEARCH_SIDE] {
         dispatch!(Level::new(), _simd => self.scores_inner(window))
     }
 
     #[inline(always)]
-    fn scores_inner(&self, window: &[f32]) -> [f32; PLACES * PLACES] {
-        let wide = self.side + 2 * REACH;
+    fn scores_inner(&self, window: &[f32]) -> [f32; SEARCH_SIDE * SEARCH_SIDE] {
+        let wide = self.side + 2 * SEARCH_RADIUS;
         debug_assert_eq!(window.len(), wide * wide + PAD);
-        let mut scores = [0.0; PLACES * PLACES];
-        for (dy, out) in scores.chunks_exact_mut(PLACES).enumerate() {
+        let mut scores = [0.0; SEARCH_SIDE * SEARCH_SIDE];
+        for (dy, out) in scores.chunks_exact_mut(SEARCH_SIDE).enumerate() {
             let (mut sum, mut squares, mut product) = ([0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
             for (r, ours) in self.centered.chunks_exact(self.side).enumerate() {
                 let row = &window[(r + dy) * wide..][..self.side - 1 + LANES];
@@ -76,7 +76,7 @@ impl Template {
 
     #[inline(always)]
     fn normalized(&self, sum: f32, squares: f32, product: f32) -> f32 {
-        // Gray levels: below a thousandth there is nothing to compare, only rounding. (A NaN passes by way of the product.)
+        // Avoids division by rounding noise of constant patches. (NaN propagates through the product.)
         product / (self.energy * (squares - sum * sum / self.centered.len() as f32).max(1e-3)).sqrt()
     }
 }
@@ -90,7 +90,7 @@ mod tests {
         #[test]
         fn all_places_at_once_are_each_place_by_itself(half in 1_usize..9, seed in any::<u32>(), hole in 0_usize..2000) {
             let side = 2 * half + 1;
-            let wide = side + 2 * REACH;
+            let wide = side + 2 * SEARCH_RADIUS;
             let mut state = seed;
             let mut random = || {
                 state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -105,7 +105,7 @@ mod tests {
             let template = Template::new(side, &patch);
             let scores = template.scores(&window);
             for (i, found) in scores.iter().enumerate() {
-                let (y, x) = (i / PLACES, i % PLACES);
+                let (y, x) = (i / SEARCH_SIDE, i % SEARCH_SIDE);
                 let one = template.score((0..side).map(|r| &window[(y + r) * wide + x..][..side]));
                 prop_assert_eq!(found.to_bits(), one.to_bits());
                 prop_assert!(one.is_nan() || one.abs() < 1.0001);
@@ -115,7 +115,7 @@ mod tests {
 
     #[test]
     fn a_patch_is_found_where_it_was_cut_out() {
-        let (side, wide) = (9, 9 + 2 * REACH);
+        let (side, wide) = (9, 9 + 2 * SEARCH_RADIUS);
         let mut window: Vec<f32> = (0..wide * wide)
             .map(|i| (i as u32).wrapping_mul(2_654_435_761).rotate_left(13).wrapping_mul(1_664_525) >> 24)
             .map(|v| v as f32)
@@ -127,8 +127,8 @@ mod tests {
             (0..side * side).map(|i| 0.5 * window[(y + i / side) * wide + x + i % side] + 40.0).collect();
         let scores = Template::new(side, &patch).scores(&window);
         let best = (0..scores.len()).max_by(|a, b| scores[*a].total_cmp(&scores[*b]));
-        assert_eq!(best, Some(y * PLACES + x));
+        assert_eq!(best, Some(y * SEARCH_SIDE + x));
         // Rounding of some eighty sums.
-        assert!((scores[y * PLACES + x] - 1.0).abs() < 1e-4);
+        assert!((scores[y * SEARCH_SIDE + x] - 1.0).abs() < 1e-4);
     }
 }

@@ -1,20 +1,20 @@
-//! The largest upright rectangle inside a mask.
+//! The largest axis-aligned rectangle inside a mask.
 
-use crate::rows::asks;
+use crate::rows::is_check_due;
 use crate::surface::Bounds;
 use cv_core::{Cancelled, ImageView, Stage};
 
-/// The rectangle of greatest area in which every pixel is true; `None` where no pixel is. O(pixels), by the stack of the largest rectangle under a
-/// histogram, row by row.
+/// Finds the rectangle of maximum area in which every pixel is true; `None` where no pixel is. O(pixels): the stack algorithm for the largest rectangle
+/// in a histogram, per row.
 pub(crate) fn largest_rectangle(mask: ImageView<'_, bool, 1>, stage: &Stage<'_>) -> Result<Option<Bounds>, Cancelled> {
     let (w, h) = mask.size();
     let mut heights = vec![0_usize; w];
     let mut best: Option<Bounds> = None;
     let area = |b: &Bounds| b.width() * b.height();
-    // Columns where bars start, and their heights, ascending.
+    // Stack of bars: start column and height, ascending.
     let mut stack: Vec<(usize, usize)> = Vec::with_capacity(w);
     for y in 0..h {
-        if asks(y, 4 * w) {
+        if is_check_due(y, 4 * w) {
             stage.check()?;
         }
         for (height, inside) in heights.iter_mut().zip(mask.row(y)) {

@@ -1,9 +1,9 @@
-//! Fields of displacements, and with them where in its photograph each pixel of a panorama comes from.
+//! Displacement fields, and the map from panorama pixels to photograph pixels.
 
 use crate::surface::{Bounds, Layout, Placement, Surface};
 use cv_core::{Point2, Scaling, Vector2};
 
-/// Displacements of one photograph on a grid over its part of the canvas.
+/// Displacement field of one photograph: a grid with bilinear interpolation over its part of the canvas.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct DisplacementField {
     /// Canvas position of the first vertex.
@@ -13,14 +13,14 @@ pub(crate) struct DisplacementField {
     spacing: f64,
     pub(super) columns: usize,
     pub(super) rows: usize,
-    /// Canvas pixels by which what the photograph shows is displaced, row by row.
+    /// Displacement of the photograph's content in canvas pixels, row-major.
     pub(super) displacement: Vec<Vector2<f64>>,
-    /// The same as a change of the photograph's pixel to look at.
+    /// The same as an offset of the sampling position, in photograph pixels.
     source_shift: Vec<[f32; 2]>,
 }
 
 impl DisplacementField {
-    /// No displacement, on a grid that covers `b`.
+    /// Creates a zero field that covers `b`.
     pub(super) fn over(b: &Bounds, spacing: f64) -> Self {
         let columns = (b.width() as f64 / spacing).ceil() as usize + 2;
         let rows = (b.height() as f64 / spacing).ceil() as usize + 2;
@@ -36,7 +36,7 @@ impl DisplacementField {
         }
     }
 
-    /// The four vertices around a canvas position and their weights; outside the grid those of the nearest position on it.
+    /// Returns the four vertices around a canvas position and their bilinear weights; positions outside the grid are clamped.
     pub(super) fn around(&self, p: Point2<f64>) -> [(usize, f64); 4] {
         let place = |v: f64, n: usize| {
             let v = v.clamp(0.0, n as f64 - 1.0001);
@@ -49,12 +49,12 @@ impl DisplacementField {
         [(i, (1.0 - fx) * (1.0 - fy)), (i + 1, fx * (1.0 - fy)), (j, (1.0 - fx) * fy), (j + 1, fx * fy)]
     }
 
-    /// How far what the photograph shows at a canvas position is displaced.
+    /// Interpolates the displacement at a canvas position.
     pub(super) fn at(&self, p: Point2<f64>) -> Vector2<f64> {
         self.around(p).iter().map(|&(i, w)| self.displacement[i] * w).sum()
     }
 
-    /// The same field on a canvas and a photograph of other sizes.
+    /// Returns the field for a canvas and a photograph scaled by these factors.
     pub(crate) fn scaled(&self, canvas: f64, photo: f64) -> Self {
         let place = |v: f64| Scaling::coordinate(v, canvas);
         Self {
@@ -67,7 +67,7 @@ impl DisplacementField {
         }
     }
 
-    /// Adds the change of the photograph's pixel to coordinates of one canvas row, from column `left` on.
+    /// Adds the offsets to the sampling positions of one canvas row that starts at column `left`.
     pub(crate) fn add_row(&self, y: f64, left: f64, us: &mut [f32], vs: &mut [f32]) {
         let v = ((y - self.top) / self.spacing).clamp(0.0, self.rows as f64 - 1.0001);
         let (row, fy) = (v as usize * self.columns, v.fract() as f32);
@@ -91,14 +91,14 @@ impl DisplacementField {
         }
     }
 
-    /// Works out `source_shift` from `displacement`.
+    /// Recomputes `source_shift` from `displacement`.
     pub(super) fn update_source_shift(&mut self, placement: &Placement, surface: &Surface) {
         for y in 0..self.rows {
             for x in 0..self.columns {
                 let i = y * self.columns + x;
                 let p = Point2::new(self.left + x as f64 * self.spacing, self.top + y as f64 * self.spacing);
-                let look = |p: Point2<f64>| placement.view.project(&surface.inverse(p + placement.origin.coords));
-                self.source_shift[i] = match (look(p), look(p - self.displacement[i])) {
+                let project = |p: Point2<f64>| placement.view.project(&surface.inverse(p + placement.origin.coords));
+                self.source_shift[i] = match (project(p), project(p - self.displacement[i])) {
                     (Some(a), Some(b)) => [(b.x - a.x) as f32, (b.y - a.y) as f32],
                     _ => [0.0; 2],
                 };
@@ -107,11 +107,11 @@ impl DisplacementField {
     }
 }
 
-/// Where in its photograph each pixel of a panorama comes from, deformations included.
+/// Map from panorama pixels to photograph pixels, displacement fields included.
 #[derive(Debug, Clone)]
 pub struct PhotoMap {
     surface: Surface,
-    /// Pixel (0, 0) of the panorama on the canvas it was drawn on.
+    /// Canvas position of panorama pixel (0, 0).
     corner: Vector2<f64>,
     pieces: Vec<(Placement, Option<DisplacementField>)>,
 }
@@ -126,7 +126,14 @@ impl PhotoMap {
         self.corner += Vector2::new(left as f64, top as f64);
     }
 
-    /// The pixel of `photo` that is shown at a pixel of the panorama, were the panorama taken from that photograph there; `None` where it does not reach.
+    /// Renumbers the photographs: `k` becomes `to[k]`.
+    pub fn renumber(&mut self, to: &[usize]) {
+        for (placement, _) in &mut self.pieces {
+            placement.photo = to.get(placement.photo).copied().unwrap_or(placement.photo);
+        }
+    }
+
+    /// Returns the pixel of `photo` that maps to a pixel of the panorama; `None` where the photograph does not cover it.
     pub fn source(&self, photo: usize, pixel: Point2<f64>) -> Option<Point2<f64>> {
         let p = pixel + self.corner;
         self.pieces.iter().filter(|(placement, _)| placement.photo == photo).find_map(|(placement, field)| {
@@ -212,19 +219,19 @@ mod tests {
         let placement = Placement { photo: 0, view, bounds: BOUNDS, origin: Point2::new(-60.0, -50.0) };
         let mut field = affine(10.0);
         field.update_source_shift(&placement, &surface);
-        let look = |p: Point2<f64>| view.project(&surface.inverse(p + placement.origin.coords)).unwrap();
+        let project = |p: Point2<f64>| view.project(&surface.inverse(p + placement.origin.coords)).unwrap();
         // At a vertex the shifted pixel is exactly what the undisplaced position shows.
         for (column, row) in [(1, 1), (4, 3), (8, 5)] {
             let p = Point2::new(field.left + 10.0 * column as f64, field.top + 10.0 * row as f64);
-            let (mut u, mut v) = ([look(p).x as f32], [look(p).y as f32]);
+            let (mut u, mut v) = ([project(p).x as f32], [project(p).y as f32]);
             field.add_row(p.y, p.x, &mut u, &mut v);
-            let want = look(p - displacement(p));
+            let want = project(p - displacement(p));
             assert!((f64::from(u[0]) - want.x).abs() < 1e-3 && (f64::from(v[0]) - want.y).abs() < 1e-3, "{p}");
         }
         // And the map says so too, where the photograph is seen.
         let map = PhotoMap { surface, corner: Vector2::zeros(), pieces: vec![(placement, Some(field))] };
         let p = Point2::new(60.0, 50.0);
-        assert!((map.source(0, p).unwrap() - look(p - displacement(p))).norm() < 1e-9);
+        assert!((map.source(0, p).unwrap() - project(p - displacement(p))).norm() < 1e-9);
         assert_eq!(map.source(1, p), None);
         let mut cropped = map.clone();
         cropped.crop(7, 3);

@@ -1,17 +1,17 @@
-//! Small smooth deformations that bring photographs together where turning the camera cannot: taken by hand, near things move against far ones
-//! (after Shum & Szeliski 2000, "local alignment", and Li et al. 2018, elastic warping).
+//! Local alignment: smooth displacement fields that compensate small parallax (after Shum & Szeliski 2000, "local alignment", and Li et al. 2018,
+//! elastic warping).
 //!
-//! Each photograph on the canvas gets a field of displacements on a coarse grid. Tie points are to be drawn at one place; the fields are to be smooth,
-//! and zero where nothing asks for more. That is linear least squares, reweighted so that false matches count little.
+//! Each photograph on the canvas has a displacement field on a coarse grid. The energy has a data term (tie points coincide), a smoothness term and a
+//! damping term (zero displacement without data); it is minimized by iteratively reweighted least squares.
 
 use crate::align::Alignment;
-use crate::surface::{DisplacementField, Layout, PAD, PLACES, Placement, REACH, Surface, Template};
+use crate::surface::{DisplacementField, Layout, PAD, Placement, SEARCH_RADIUS, SEARCH_SIDE, Surface, Template};
 use cv_core::{Cancelled, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
 use cv_imgproc::bilinear_at;
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 
-/// Two placements' positions of one thing on the canvas, before anything is displaced.
+/// A correspondence of two placements, in canvas pixels before displacement.
 #[derive(Clone, Copy)]
 struct TiePoint {
     p: usize,
@@ -22,27 +22,27 @@ struct TiePoint {
 
 /// Grid cells along the side of a photograph.
 const CELLS: f64 = 24.0;
-/// Weight of a difference between neighboring vertices against a tie point.
+/// Weight of the smoothness term relative to a tie point.
 const SMOOTHNESS: f64 = 0.15;
-/// Weight of a displacement itself: what one place asks for fades out over √(SMOOTHNESS / DAMPING) = 5 cells, a fifth of a photograph.
+/// Weight of the damping term: a displacement decays over √(SMOOTHNESS / DAMPING) = 5 cells, a fifth of a photograph.
 const DAMPING: f64 = 0.006;
-/// Matches farther apart than this share of a photograph's side are no parallax.
-const FARTHEST: f64 = 0.04;
+/// Maximum displacement of a tie point relative to the side of a photograph; larger ones are outliers.
+const MAX_DISPLACEMENT_RATIO: f64 = 0.04;
 
-/// Displacements for every placement.
+/// Estimates the displacement field of every placement.
 pub(crate) fn displacements(
     photos: &[ImageView<'_, u8, 3>],
     layout: &Layout,
     alignment: &Alignment,
     progress: &dyn Progress,
 ) -> Result<Vec<Option<DisplacementField>>, Cancelled> {
-    // A unit per photograph, and one for every solution and every registration of patches.
+    // A unit per photograph, and one for every solution and every round of patch registration.
     let stage = Stage::new(progress, "elastic", photos.len() + 5)?;
     let side = layout.typical_side();
     let spacing = (side / CELLS).max(8.0);
     let mut fields: Vec<_> = layout.placements.iter().map(|p| DisplacementField::over(&p.bounds, spacing)).collect();
-    let mut ties = feature_ties(layout, alignment, FARTHEST * side, &stage)?;
-    // Feature positions are good to a pixel or so of the photographs they were found on, patches to a fraction.
+    let mut ties = feature_ties(layout, alignment, MAX_DISPLACEMENT_RATIO * side, &stage)?;
+    // Feature positions have errors of up to a pixel, registered patches of a fraction.
     solve(&mut fields, &ties, 3.0, &stage)?;
     stage.add(1)?;
     let gray = |p: &ImageView<'_, u8, 3>| {
@@ -50,13 +50,13 @@ pub(crate) fn displacements(
         stage.add(1).map(|()| gray)
     };
     let grays: Vec<GrayU8> = photos.par_iter().map(gray).collect::<Result<_, _>>()?;
-    let mut places = patch_places(layout, spacing);
+    let mut sites = patch_sites(layout, spacing);
     let features = ties.len();
-    // Twice: what the first round brings within reach, the second registers.
+    // The first round brings more patches within the search range of the second.
     for _ in 0..2 {
-        look(&mut places, &grays, layout, &fields, &stage)?;
+        register_patches(&mut sites, &grays, layout, &fields, &stage)?;
         ties.truncate(features);
-        ties.extend(places.iter().filter_map(|place| place.tie));
+        ties.extend(sites.iter().filter_map(|site| site.tie));
         stage.add(1)?;
         solve(&mut fields, &ties, 3.0, &stage)?;
         stage.add(1)?;
@@ -67,8 +67,8 @@ pub(crate) fn displacements(
     Ok(fields.into_iter().map(Some).collect())
 }
 
-/// Where a placement draws a pixel of its photograph, before anything is displaced.
-fn drawn(placement: &Placement, surface: &Surface, pixel: Point2<f64>) -> Option<Point2<f64>> {
+/// Maps a pixel of a photograph to the canvas, before displacement.
+fn to_canvas(placement: &Placement, surface: &Surface, pixel: Point2<f64>) -> Option<Point2<f64>> {
     let mut p = surface.forward(&placement.view.ray(pixel)?)? - placement.origin.coords;
     if let Some(period) = surface.period() {
         let middle = 0.5 * (placement.bounds.left + placement.bounds.right) as f64;
@@ -77,11 +77,11 @@ fn drawn(placement: &Placement, surface: &Surface, pixel: Point2<f64>) -> Option
     Some(p)
 }
 
-/// Tie points from the matches of the alignment, without those that lie too far apart to be parallax.
+/// Returns tie points from the matches of the alignment, without outliers.
 fn feature_ties(
     layout: &Layout,
     alignment: &Alignment,
-    farthest: f64,
+    max_displacement: f64,
     stage: &Stage<'_>,
 ) -> Result<Vec<TiePoint>, Cancelled> {
     let mut ties = Vec::new();
@@ -90,11 +90,12 @@ fn feature_ties(
         for (p, first) in layout.placements.iter().enumerate().filter(|(_, p)| p.photo == pair.a) {
             for (q, second) in layout.placements.iter().enumerate().filter(|(_, q)| q.photo == pair.b) {
                 for m in &pair.matches {
-                    let (Some(a), Some(b)) = (drawn(first, &layout.surface, m.a), drawn(second, &layout.surface, m.b))
+                    let (Some(a), Some(b)) =
+                        (to_canvas(first, &layout.surface, m.a), to_canvas(second, &layout.surface, m.b))
                     else {
                         continue;
                     };
-                    if (a - b).norm() < farthest {
+                    if (a - b).norm() < max_displacement {
                         ties.push(TiePoint { p, q, a, b });
                     }
                 }
@@ -104,14 +105,14 @@ fn feature_ties(
     Ok(ties)
 }
 
-/// Iteratively reweighted least squares, by conjugate gradients: a tie point off by `scale` pixels counts half (Cauchy's weight).
+/// Solves for the fields by iteratively reweighted least squares (Cauchy weights of `scale` pixels) and conjugate gradients.
 fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage: &Stage<'_>) -> Result<(), Cancelled> {
     let mut offsets = vec![0];
     for f in fields.iter() {
         offsets.push(offsets[offsets.len() - 1] + f.displacement.len());
     }
     let n = offsets[fields.len()];
-    /// Of a tie: eight vertices and their signed weights, and what is to be closed.
+    /// A residual: eight vertices with signed weights, and the displacement to be compensated.
     type Term = ([(usize, f64); 8], Vector2<f64>);
     let terms: Vec<Term> = ties
         .iter()
@@ -140,7 +141,7 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
     let mut d: Vec<Vector2<f64>> = fields.iter().flat_map(|f| f.displacement.iter().copied()).collect();
     let left = |d: &[Vector2<f64>], t: &[(usize, f64); 8]| -> Vector2<f64> { t.iter().map(|&(i, w)| d[i] * w).sum() };
     for round in 0..5 {
-        // From wide to narrow, so that no false match decides what counts as one.
+        // The scale shrinks from round to round (graduated non-convexity).
         let scale = scale * f64::from(1 << (4 - round.min(4)));
         let weights: Vec<f64> =
             terms.iter().map(|(t, want)| 1.0 / (1.0 + (left(&d, t) - want).norm_squared() / (scale * scale))).collect();
@@ -180,7 +181,7 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
     Ok(())
 }
 
-/// Conjugate gradients with the diagonal as preconditioner, from `x` on.
+/// Solves by conjugate gradients with Jacobi preconditioner, starting from `x`.
 fn conjugate_gradients(
     apply: impl Fn(&[Vector2<f64>]) -> Vec<Vector2<f64>>,
     right: &[Vector2<f64>],
@@ -188,7 +189,7 @@ fn conjugate_gradients(
     x: &mut [Vector2<f64>],
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
-    // The two axes are two problems with one matrix: products are taken per axis.
+    // The two axes are independent systems with a common matrix.
     let dot = |a: &[Vector2<f64>], b: &[Vector2<f64>]| -> Vector2<f64> {
         a.iter().zip(b).map(|(a, b)| a.component_mul(b)).sum()
     };
@@ -198,14 +199,14 @@ fn conjugate_gradients(
     let mut z = scaled(&r);
     let mut direction = z.clone();
     let mut rz = dot(&r, &z);
-    // Against the right side, not against the first residual: what a former solution leaves may be small already.
+    // The tolerance is relative to the right-hand side, as the initial residual may be small.
     let whole = dot(right, &scaled(right));
     for iteration in 0..200 {
         // An iteration on a hundred thousand matches is some milliseconds.
         if iteration % 8 == 0 {
             stage.check()?;
         }
-        // A thousandth of the error a pixel leaves is enough.
+        // Convergence tolerance: a thousandth of a pixel.
         if rz.x <= 1e-8 * whole.x.max(1e-6) && rz.y <= 1e-8 * whole.y.max(1e-6) {
             break;
         }
@@ -227,32 +228,35 @@ fn conjugate_gradients(
     Ok(())
 }
 
-/// Half the side of the patches that are compared.
-const HALF: usize = 8;
-/// Patches tried in each overlap at most.
-const PER_OVERLAP: usize = 800;
+/// Patch radius in canvas pixels.
+const PATCH_RADIUS: usize = 8;
+/// Maximum number of patches per overlap.
+const MAX_PATCHES: usize = 800;
 
-/// A place where two placements are compared.
-struct Place {
+/// A canvas position where the patches of two placements are registered.
+struct PatchSite {
     p: usize,
     q: usize,
     at: Point2<f64>,
-    /// What was found.
+    /// The correspondence, where registration succeeded.
     tie: Option<TiePoint>,
-    /// How far the fields had moved one against the other when it was last looked at; `None` before that.
-    looked: Option<Vector2<f64>>,
-    /// Whether there is nothing to compare.
-    is_plain: bool,
+    /// Relative displacement of the two fields at the last registration; `None` before the first.
+    registered_at: Option<Vector2<f64>>,
+    /// Whether the texture is too low for registration.
+    is_low_texture: bool,
 }
 
-/// Canvas pixels by which the fields must have moved before what was not alike is compared again: a step of the search.
-const MOVED: f64 = 1.0;
-/// Canvas pixels within which the fields bring a tie point together: looked at again, it would be found at the same place.
-const CLOSED: f64 = 0.5;
+/// Minimum smaller eigenvalue of the structure tensor of a corner: gradients of 2.5 gray levels per pixel in both directions; noise dominates below.
+const MIN_CORNER_STRENGTH: f32 = 6.0;
 
-/// Places on a grid over every overlap.
-fn patch_places(layout: &Layout, spacing: f64) -> Vec<Place> {
-    let mut places = Vec::new();
+/// Relative displacement of the fields, in canvas pixels, after which a failed registration is repeated.
+const MIN_FIELD_CHANGE_PX: f64 = 1.0;
+/// Residual of a tie point, in canvas pixels, below which its registration is not repeated.
+const CONVERGED_PX: f64 = 0.5;
+
+/// Returns a grid of patch positions over every overlap.
+fn patch_sites(layout: &Layout, spacing: f64) -> Vec<PatchSite> {
+    let mut sites = Vec::new();
     for (p, first) in layout.placements.iter().enumerate() {
         for (q, second) in layout.placements.iter().enumerate().skip(p + 1) {
             let Some(common) = first.bounds.intersection(&second.bounds) else { continue };
@@ -260,75 +264,74 @@ fn patch_places(layout: &Layout, spacing: f64) -> Vec<Place> {
                 continue;
             }
             let step =
-                ((common.width() * common.height()) as f64 / PER_OVERLAP as f64).sqrt().max(0.5 * spacing).max(1.0);
+                ((common.width() * common.height()) as f64 / MAX_PATCHES as f64).sqrt().max(0.5 * spacing).max(1.0);
             let (across, down) = ((common.width() as f64 / step) as usize, (common.height() as f64 / step) as usize);
             for y in 0..down {
                 for x in 0..across {
                     let at = |first: usize, i: usize| (first as f64 + (i as f64 + 0.5) * step).round();
                     let at = Point2::new(at(common.left, x), at(common.top, y));
-                    places.push(Place { p, q, at, tie: None, looked: None, is_plain: false });
+                    sites.push(PatchSite { p, q, at, tie: None, registered_at: None, is_low_texture: false });
                 }
             }
         }
     }
-    places
+    sites
 }
 
-/// Compares the patches of the photographs, as drawn with the fields so far, at the places where that may say something new.
-fn look(
-    places: &mut [Place],
+/// Registers the patches at all sites, warped with the current fields, where the result may differ from the last one.
+fn register_patches(
+    sites: &mut [PatchSite],
     photos: &[GrayU8],
     layout: &Layout,
     fields: &[DisplacementField],
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
-    places.par_iter_mut().enumerate().try_for_each(|(i, place)| {
+    sites.par_iter_mut().enumerate().try_for_each(|(i, site)| {
         if i % 64 == 0 {
             stage.check()?;
         }
-        let (p, q, c) = (place.p, place.q, place.at);
+        let (p, q, c) = (site.p, site.q, site.at);
         let apart = fields[p].at(c) - fields[q].at(c);
-        let is_known = match (&place.tie, place.looked) {
-            _ if place.is_plain => true,
-            (Some(tie), _) => (tie.a + fields[p].at(tie.a) - tie.b - fields[q].at(tie.b)).norm() < CLOSED,
-            (None, Some(before)) => (apart - before).norm() < MOVED,
+        let is_known = match (&site.tie, site.registered_at) {
+            _ if site.is_low_texture => true,
+            (Some(tie), _) => (tie.a + fields[p].at(tie.a) - tie.b - fields[q].at(tie.b)).norm() < CONVERGED_PX,
+            (None, Some(before)) => (apart - before).norm() < MIN_FIELD_CHANGE_PX,
             (None, None) => false,
         };
         if is_known {
             return Ok(());
         }
-        (place.tie, place.looked) = (None, Some(apart));
-        let Some(first) = patch(photos, layout, &fields[p], p, c, HALF) else { return Ok(()) };
-        // Texture in both directions of two and a half gray levels a pixel: below that noise decides where the best place is.
-        place.is_plain = corner_strength(&first) < 6.0;
-        if !place.is_plain
-            && let Some(second) = patch(photos, layout, &fields[q], q, c, HALF + REACH)
+        (site.tie, site.registered_at) = (None, Some(apart));
+        let Some(first) = patch(photos, layout, &fields[p], p, c, PATCH_RADIUS) else { return Ok(()) };
+        site.is_low_texture = corner_strength(&first) < MIN_CORNER_STRENGTH;
+        if !site.is_low_texture
+            && let Some(second) = patch(photos, layout, &fields[q], q, c, PATCH_RADIUS + SEARCH_RADIUS)
             && let Some(offset) = register(&first, second)
         {
             let other = c + offset;
-            place.tie = Some(TiePoint { p, q, a: c - fields[p].at(c), b: other - fields[q].at(other) });
+            site.tie = Some(TiePoint { p, q, a: c - fields[p].at(c), b: other - fields[q].at(other) });
         }
         Ok(())
     })
 }
 
-/// A placement as drawn around a canvas pixel, `2 half + 1` on a side; `None` where it is not wholly inside the photograph.
+/// Samples a placement around a canvas pixel, side `2 radius + 1`; `None` where the patch is not completely inside the photograph.
 fn patch(
     photos: &[GrayU8],
     layout: &Layout,
     field: &DisplacementField,
     p: usize,
     c: Point2<f64>,
-    half: usize,
+    radius: usize,
 ) -> Option<Vec<f32>> {
     let placement = &layout.placements[p];
     let photo = photos.get(placement.photo)?;
-    let look =
+    let to_pixel =
         |c: Point2<f64>| placement.view.project(&layout.surface.inverse(c - field.at(c) + placement.origin.coords));
-    // Over a patch the map is as good as affine.
-    let h = half as f64;
-    let middle = look(c)?;
-    let (right, down) = (look(c + Vector2::new(h, 0.0))?, look(c + Vector2::new(0.0, h))?);
+    // The map is affine to first order over a patch.
+    let h = radius as f64;
+    let middle = to_pixel(c)?;
+    let (right, down) = (to_pixel(c + Vector2::new(h, 0.0))?, to_pixel(c + Vector2::new(0.0, h))?);
     let (ux, uy) = ((right - middle) / h, (down - middle) / h);
     for (i, j) in [(-h, -h), (h, -h), (-h, h), (h, h)] {
         let corner = middle + ux * i + uy * j;
@@ -340,15 +343,15 @@ fn patch(
             return None;
         }
     }
-    let side = 2 * half + 1;
+    let side = 2 * radius + 1;
     let mut values = vec![0.0; side * side];
     let (middle, ux, uy) = (middle.coords.cast::<f32>(), ux.cast::<f32>(), uy.cast::<f32>());
-    let corner = middle - (ux + uy) * half as f32;
+    let corner = middle - (ux + uy) * radius as f32;
     dispatch!(Level::new(), _simd => sample_patch(photo, corner, ux, uy, &mut values));
     Some(values)
 }
 
-/// Values at the places `corner + i ux + j uy` of a square, all of which lie inside.
+/// Samples the positions `corner + i ux + j uy` of a square inside the image.
 #[inline(always)]
 fn sample_patch(photo: &GrayU8, corner: Vector2<f32>, ux: Vector2<f32>, uy: Vector2<f32>, values: &mut [f32]) {
     let (width, height) = photo.size();
@@ -359,16 +362,16 @@ fn sample_patch(photo: &GrayU8, corner: Vector2<f32>, ux: Vector2<f32>, uy: Vect
         let (u0, v0) = (corner.x + uy.x * j as f32, corner.y + uy.y * j as f32);
         for (i, value) in row.iter_mut().enumerate() {
             let (u, v) = (u0 + ux.x * i as f32, v0 + ux.y * i as f32);
-            // Rounding to single precision may reach the last column or row.
+            // Single-precision rounding may reach the last column or row.
             let (x, y) = (u.min(right) as usize, v.min(bottom) as usize);
             [*value] = bilinear_at(view, x, y, u - x as f32, v - y as f32);
         }
     }
 }
 
-/// The lesser eigenvalue of the mean structure tensor of a patch.
+/// Computes the smaller eigenvalue of the mean structure tensor of a patch (Shi & Tomasi 1994).
 fn corner_strength(patch: &[f32]) -> f32 {
-    let side = 2 * HALF + 1;
+    let side = 2 * PATCH_RADIUS + 1;
     let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
     for r in 1..side - 1 {
         for c in 1..side - 1 {
@@ -383,22 +386,27 @@ fn corner_strength(patch: &[f32]) -> f32 {
     (0.5 * (xx + yy) - (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt()) / n
 }
 
-/// How far the content of `first` lies from the middle of the larger `second`, by normalized correlation with a parabola at its peak; `None` where nothing is
-/// alike, or two places are.
+/// Minimum correlation of registered patches.
+const MIN_CORRELATION: f32 = 0.85;
+/// Correlations within this of the maximum make it ambiguous.
+const AMBIGUITY: f32 = 0.05;
+
+/// Estimates the displacement of `first` in the larger window `second` by normalized cross-correlation with parabolic sub-pixel interpolation; `None` for a low
+/// or ambiguous maximum.
 fn register(first: &[f32], mut second: Vec<f32>) -> Option<Vector2<f64>> {
     second.resize(second.len() + PAD, 0.0);
-    let scores = Template::new(2 * HALF + 1, first).scores(&second);
+    let scores = Template::new(2 * PATCH_RADIUS + 1, first).scores(&second);
     let (best, &score) = scores.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
-    let (y, x) = (best / PLACES, best % PLACES);
-    if score < 0.85 || x == 0 || y == 0 || x == PLACES - 1 || y == PLACES - 1 {
+    let (y, x) = (best / SEARCH_SIDE, best % SEARCH_SIDE);
+    if score < MIN_CORRELATION || x == 0 || y == 0 || x == SEARCH_SIDE - 1 || y == SEARCH_SIDE - 1 {
         return None;
     }
-    // Repeated structure: another place that is nearly as good, not beside the best.
-    let rival = scores.iter().enumerate().any(|(i, s)| {
-        let far = (i / PLACES).abs_diff(y).max((i % PLACES).abs_diff(x)) > 2;
-        far && *s > score - 0.05
+    // Repeated structure: a second maximum that is nearly as high.
+    let is_ambiguous = scores.iter().enumerate().any(|(i, s)| {
+        let far = (i / SEARCH_SIDE).abs_diff(y).max((i % SEARCH_SIDE).abs_diff(x)) > 2;
+        far && *s > score - AMBIGUITY
     });
-    if rival {
+    if is_ambiguous {
         return None;
     }
     let parabola = |a: f32, b: f32, c: f32| {
@@ -406,8 +414,8 @@ fn register(first: &[f32], mut second: Vec<f32>) -> Option<Vector2<f64>> {
         if curvature < 0.0 { f64::from(0.5 * (a - c) / curvature).clamp(-0.5, 0.5) } else { 0.0 }
     };
     let fx = parabola(scores[best - 1], score, scores[best + 1]);
-    let fy = parabola(scores[best - PLACES], score, scores[best + PLACES]);
-    Some(Vector2::new(x as f64 + fx - REACH as f64, y as f64 + fy - REACH as f64))
+    let fy = parabola(scores[best - SEARCH_SIDE], score, scores[best + SEARCH_SIDE]);
+    Some(Vector2::new(x as f64 + fx - SEARCH_RADIUS as f64, y as f64 + fy - SEARCH_RADIUS as f64))
 }
 
 #[cfg(test)]
@@ -435,12 +443,12 @@ mod tests {
         }
     }
 
-    /// By how many pixels the second photograph is bent: what it shows at `p` belongs to `p + bend(p)`.
+    /// Known deformation of the second photograph: pixel `p` shows the ray of `p + bend(p)`.
     fn bend(p: Point2<f64>) -> Vector2<f64> {
         Vector2::new(2.5 * (p.y / 40.0).sin(), 2.0 * (p.x / 50.0).cos())
     }
 
-    /// Root mean square distance, over the overlap, between the places of one direction in the second photograph: as the map says and as the bend is.
+    /// RMS error, over the overlap, of the map against the known deformation of the second photograph.
     fn misfit(map: &PhotoMap, views: &[View], size: (usize, usize)) -> f64 {
         let (mut sum, mut n) = (0.0, 0.0);
         for (x, y) in (0..size.1).step_by(5).flat_map(|y| (0..size.0).step_by(5).map(move |x| (x, y))) {
@@ -459,7 +467,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bent_photograph_is_brought_to_where_the_other_shows_the_same() {
+    fn a_deformed_photograph_is_aligned_with_the_other() {
         let views = [view(-0.2), view(0.2)];
         let first = photograph(&views[0], sky);
         let second = cv_core::RgbU8::from_fn(240, 180, |x, y| {
@@ -485,7 +493,7 @@ mod tests {
     }
 
     #[test]
-    fn photographs_that_fit_are_left_as_they_are() {
+    fn aligned_photographs_are_not_displaced() {
         let views = [view(-0.2), view(0.2)];
         let photos = [photograph(&views[0], sky), photograph(&views[1], sky)];
         let alignment = alignment(&views);
@@ -498,7 +506,7 @@ mod tests {
     }
 
     #[test]
-    fn matches_become_tie_points_unless_they_lie_too_far_apart() {
+    fn matches_become_tie_points_up_to_the_maximum_displacement() {
         let views = [view(-0.2), view(0.2)];
         let mut set = alignment(&views);
         let ray = Vector3::new(0.05, 0.1, 1.0);
@@ -508,7 +516,7 @@ mod tests {
         let layout = layout(&set, Projection::Spherical, &Framing::default(), 1.0, 1_000_000).unwrap();
         let ties = feature_ties(&layout, &set, 10.0, &stage()).unwrap();
         assert_eq!(ties.len(), 1);
-        // One direction is drawn at one place.
+        // A direction maps to one canvas position.
         assert!((ties[0].a - ties[0].b).norm() < 1e-9 && (ties[0].p, ties[0].q) == (0, 1));
         assert_eq!(feature_ties(&layout, &set, 40.0, &stage()).unwrap().len(), 2);
     }
@@ -546,23 +554,23 @@ mod tests {
     fn a_patch_is_registered_to_a_fraction_of_a_pixel() {
         let value =
             |x: f64, y: f64| (128.0 + 50.0 * (x * 0.4 + y * 0.1).sin() + 40.0 * (y * 0.35 - x * 0.07).cos()) as f32;
-        let patch = |half: usize, at: Vector2<f64>| -> Vec<f32> {
-            let h = half as i32;
+        let patch = |radius: usize, at: Vector2<f64>| -> Vec<f32> {
+            let h = radius as i32;
             let rows = (-h..=h).flat_map(|j| (-h..=h).map(move |i| (i, j)));
             rows.map(|(i, j)| value(f64::from(i) + at.x, f64::from(j) + at.y)).collect()
         };
-        let first = patch(HALF, Vector2::zeros());
+        let first = patch(PATCH_RADIUS, Vector2::zeros());
         for offset in [Vector2::new(0.0, 0.0), Vector2::new(3.3, -2.6), Vector2::new(-4.5, 1.2)] {
             // The content of the first lies at `offset` in the second.
-            let found = register(&first, patch(HALF + REACH, -offset)).unwrap();
-            // A patch is about one wave long, so its mean and energy change with its place: that moves the peak by a tenth or two.
+            let found = register(&first, patch(PATCH_RADIUS + SEARCH_RADIUS, -offset)).unwrap();
+            // A patch is about one wave long, so its mean and energy change with its position: that moves the peak by a tenth or two.
             assert!((found - offset).norm() < 0.2, "{found} {offset}");
         }
         // Where nothing is alike.
-        let side = 2 * (HALF + REACH) + 1;
+        let side = 2 * (PATCH_RADIUS + SEARCH_RADIUS) + 1;
         assert_eq!(register(&first, vec![128.0; side * side]), None);
-        assert!(corner_strength(&first) > 6.0);
-        // One direction only: the lesser eigenvalue of the structure tensor is zero.
+        assert!(corner_strength(&first) > MIN_CORNER_STRENGTH);
+        // One direction only: the smaller eigenvalue of the structure tensor is zero.
         let edge: Vec<f32> = (0..17 * 17).map(|i| if i % 17 < 8 { 10.0 } else { 200.0 }).collect();
         assert!(corner_strength(&edge).abs() < 1e-2);
     }

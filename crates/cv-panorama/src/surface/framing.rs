@@ -1,4 +1,4 @@
-//! Which part of the scene is drawn: the window of a surface, and what photographs show in it.
+//! Framing: the requested field of view, and the extent of photographs within it.
 
 use crate::align::{View, turn};
 use crate::surface::{Bounds, Surface};
@@ -6,28 +6,28 @@ use cv_core::{Matrix3, OptionError, Point2, Vector2, Vector3};
 use nalgebra::Rotation3;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-/// Which part of the scene is drawn: like a camera that is turned and given a lens. The default draws all that the photographs show.
+/// Orientation and field of view of the panorama, as of a virtual camera. The default covers all photographs.
 ///
-/// Angles are in radians. Without effect, and refused, where the scene is flat ([`CameraMotion::Homography`](crate::CameraMotion::Homography)).
+/// Angles are in radians. An error for planar scenes ([`CameraMotion::Homography`](crate::CameraMotion::Homography)).
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Framing {
-    /// Where the middle of the surface looks: to the right of the middle of the photographs by `[0]`, −2π … 2π, and above the horizon by `[1]`, −π/2 … π/2. The surface is turned there, so
-    /// that on a cylinder, say, the horizon is straight at `[1] = 0` only. Default `None`: the middle of the photographs at the horizon; a surface that does not go around is turned up or
-    /// down with photographs that lie more than 25° from there.
+    /// Direction of the surface center: yaw `[0]` to the right of the center of the photographs, −2π … 2π, and pitch `[1]` above the horizon, −π/2 … π/2. The surface is rotated, so that
+    /// on a cylinder, for example, the horizon is straight at `[1] = 0` only. Default `None`: the center of the photographs at the horizon; a non-periodic surface is tilted toward
+    /// photographs whose pitch exceeds 25°.
     pub center: Option<[f64; 2]>,
-    /// By how much the picture is turned clockwise, −π … π. Default 0.
+    /// Clockwise roll of the image, −π … π. Default 0.
     pub roll: f64,
-    /// Angle across the picture, through its middle: above 0, at most [`Projection::widest_field`](crate::Projection::widest_field). The picture is just as wide, empty where no photograph
-    /// reaches. Default `None`: as far as the photographs reach, and the middle of the surface need not be that of the picture.
+    /// Horizontal field of view through the image center: above 0, at most [`Projection::widest_field`](crate::Projection::widest_field). The image has exactly this width, empty where no
+    /// photograph covers it. Default `None`: the extent of the photographs; the surface center then need not be the image center.
     pub across: Option<f64>,
-    /// The same from top to bottom. Default `None`: as far as the photographs reach.
+    /// Vertical field of view, likewise. Default `None`: the extent of the photographs.
     pub up: Option<f64>,
 }
 
 impl Framing {
-    /// Whether the angles are numbers in their ranges; how wide a field may be, the surface says.
+    /// Checks that the angles are in range; the maximum field of view depends on the projection.
     pub(crate) fn check(&self) -> Result<(), OptionError> {
-        // Degrees that people type come with a rounding.
+        // Tolerance for angles converted from degrees.
         let within = |limit: f64| move |v: f64| v.abs() <= limit + 1e-9;
         if let Some([yaw, pitch]) = self.center {
             OptionError::check("yaw", yaw, "from -2π to 2π", within(TAU))?;
@@ -42,7 +42,7 @@ impl Framing {
         Ok(())
     }
 
-    /// The rotation that takes a level world whose middle is `middle` (a longitude) to the surface; `pitch` is where it looks unless `center` says.
+    /// Returns the rotation from a level world centered at longitude `middle` to the surface; `pitch` is the default where `center` is `None`.
     pub(crate) fn frame(&self, middle: f64, pitch: f64) -> Matrix3<f64> {
         let [yaw, pitch] = self.center.unwrap_or([0.0, pitch]);
         // Y points down: what lies above is brought to the middle by a turn about X towards negative angles.
@@ -52,10 +52,10 @@ impl Framing {
     }
 }
 
-/// Samples along each side of a photograph's border.
-const PER_SIDE: usize = 256;
-/// Samples along each side of a window.
-const PER_EDGE: usize = 512;
+/// Samples per side of a photograph's border.
+const SAMPLES_PER_SIDE: usize = 256;
+/// Samples per side of a window.
+const SAMPLES_PER_EDGE: usize = 512;
 
 /// A rectangle of surface coordinates.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -65,7 +65,7 @@ pub(crate) struct Window {
 }
 
 impl Window {
-    /// Of this half width and half height around the middle of the surface.
+    /// Creates the window of this half width and half height around the surface center.
     pub(crate) fn around_middle(half: Vector2<f64>) -> Self {
         Self { min: (-half).into(), max: half.into() }
     }
@@ -74,33 +74,33 @@ impl Window {
         p.x >= self.min.x && p.x <= self.max.x && p.y >= self.min.y && p.y <= self.max.y
     }
 
-    /// The smallest that holds both.
+    /// Returns the bounding box of both.
     pub(crate) fn joined(&self, other: &Self) -> Self {
         Self { min: self.min.inf(&other.min), max: self.max.sup(&other.max) }
     }
 
-    /// Left and right half.
+    /// Splits the window into its left and right half.
     fn halves(&self) -> [Self; 2] {
         let middle = 0.5 * (self.min.x + self.max.x);
         [Self { max: Point2::new(middle, self.max.y), ..*self }, Self { min: Point2::new(middle, self.min.y), ..*self }]
     }
 
-    /// Whether a point of the edges lies at the top or the bottom.
+    /// Returns whether a point of the edges lies at the top or the bottom.
     fn is_end(&self, p: Point2<f64>) -> bool {
         p.y <= self.min.y || p.y >= self.max.y
     }
 
-    /// Points along the edges.
+    /// Samples the edges.
     fn edges(&self) -> impl Iterator<Item = Point2<f64>> + '_ {
         let at = |t: f64, a: f64, b: f64| a + t * (b - a);
-        (0..=PER_EDGE).map(|i| i as f64 / PER_EDGE as f64).flat_map(move |t| {
+        (0..=SAMPLES_PER_EDGE).map(|i| i as f64 / SAMPLES_PER_EDGE as f64).flat_map(move |t| {
             let (x, y) = (at(t, self.min.x, self.max.x), at(t, self.min.y, self.max.y));
             let sides = [(x, self.min.y), (x, self.max.y), (self.min.x, y), (self.max.x, y)];
             sides.map(|(x, y)| Point2::new(x, y))
         })
     }
 
-    /// The canvas pixels of a canvas whose pixel (0, 0) lies at `origin`, with `slack` pixels to all sides.
+    /// Converts to pixels of a canvas whose pixel (0, 0) is at `origin`, with a margin of `slack` pixels.
     pub(crate) fn pixels(&self, origin: Point2<f64>, slack: f64, (width, height): (usize, usize)) -> Option<Bounds> {
         let clamp = |v: f64, limit: usize| v.clamp(0.0, limit as f64) as usize;
         let bounds = Bounds {
@@ -113,21 +113,21 @@ impl Window {
     }
 }
 
-/// What a photograph shows of a window.
+/// The extent of a photograph in a window.
 pub(crate) struct Shown {
-    /// The boxes around it: none, one, or two where the photograph lies across the cut of a surface that goes around.
+    /// Bounding boxes: none, one, or two where the photograph crosses the ±180° meridian of a periodic surface.
     pub(crate) boxes: Vec<Window>,
-    /// Whether the photograph reaches beyond the window.
+    /// Whether the photograph extends beyond the window.
     pub(crate) reaches_beyond: bool,
 }
 
-/// What a photograph shows of a window, whose left and right edges may be a full turn apart.
+/// Computes the extent of a photograph in a window, whose left and right edges may be a full turn apart.
 ///
-/// The box around a region of the plane, cut to a window, is that around the part of the region's border in the window and the part of the window's edges in the region. So neither
-/// poles, nor cuts, nor points at infinity need a thought. To a sample along either, by which edges count as reached too little.
+/// The bounding box of a region clipped to a window is that of the region's border inside the window and of the window's edges inside the region. Poles, meridians and points at
+/// infinity need no special cases. Accurate to one sample of either.
 pub(crate) fn shown(view: &View, surface: &Surface, window: &Window) -> Shown {
-    // Of a distorted lens, nothing beyond the photograph's border: its polynomial may fold back.
-    let border = view.border(PER_SIDE);
+    // Distortion polynomials may not be monotonic outside the photograph.
+    let border = view.border(SAMPLES_PER_SIDE);
     let radius = |p: Point2<f64>| view.camera.normalize(p).coords.norm_squared();
     let limit = 1.05 * border.iter().map(|p| radius(*p)).filter(|r| r.is_finite()).fold(0.0, f64::max);
     let sees = |ray: &Vector3<f64>| {
@@ -137,7 +137,7 @@ pub(crate) fn shown(view: &View, surface: &Surface, window: &Window) -> Shown {
     };
     let border: Vec<Option<Point2<f64>>> =
         border.into_iter().map(|pixel| view.ray(pixel).and_then(|ray| surface.forward(&ray))).collect();
-    // A pole, or all that lies at infinity, may be inside of the border.
+    // The border may enclose a pole or points at infinity.
     let ends = || surface.diverges() && window.edges().any(|p| window.is_end(p) && sees(&surface.inverse(p)));
     let reaches_beyond = border.iter().any(|p| p.is_none_or(|p| !window.contains(p))) || ends();
     let shown_in = |part: &Window| -> Option<Window> {
@@ -150,7 +150,7 @@ pub(crate) fn shown(view: &View, surface: &Surface, window: &Window) -> Shown {
         Some(_) => {
             let halves = window.halves();
             match halves.each_ref().map(shown_in) {
-                // In one piece where it reaches across the middle, not around the back.
+                // One box where it crosses the center, not the ±180° meridian.
                 [Some(left), Some(right)] if left.max.x >= halves[0].max.x && right.min.x <= halves[1].min.x => {
                     vec![left.joined(&right)]
                 }
@@ -161,9 +161,9 @@ pub(crate) fn shown(view: &View, surface: &Surface, window: &Window) -> Shown {
     Shown { boxes, reaches_beyond }
 }
 
-/// Canvas pixels by which boxes of [`shown`] may be too small: a sample of the window's edges, and the curvature of a border between two samples.
+/// Margin, in canvas pixels, of the boxes of [`shown`]: one sample of the window's edges, and the curvature of a border between two samples.
 pub(crate) fn slack(window: &Window) -> f64 {
-    2.0 + (window.max - window.min).amax() / PER_EDGE as f64
+    2.0 + (window.max - window.min).amax() / SAMPLES_PER_EDGE as f64
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! The canvas: which surface, how large, and where each photograph falls on it.
+//! Canvas layout: projection, size, and the bounds of each photograph.
 
 use crate::align::View;
 use crate::align::turn;
@@ -9,14 +9,14 @@ use cv_core::{Matrix3, Point2, Vector2, Vector3};
 use nalgebra::Rotation3;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-/// Why there is no canvas for the panorama.
+/// Why the canvas cannot be laid out.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum LayoutError {
-    /// No photograph is placed.
+    /// No photograph is registered.
     #[error("there is no photograph to draw")]
     Nothing,
-    /// The canvas would be too large.
+    /// The canvas exceeds the limit.
     #[error("the {projection} canvas would be {width:.0} x {height:.0} pixels, more than the limit of {max_pixels}")]
     TooLarge {
         /// Width in pixels.
@@ -28,55 +28,55 @@ pub enum LayoutError {
         /// The surface.
         projection: Projection,
     },
-    /// The photographs reach beyond what the surface can hold.
+    /// The field of view of the photographs exceeds that of the projection.
     #[error("the photographs span {degrees:.0} degrees, more than the {projection} projection can hold")]
     TooWide {
-        /// Angle between the middle and the farthest point, doubled, in degrees.
+        /// Twice the angle between the center and the farthest point, in degrees.
         degrees: f64,
         /// The surface.
         projection: Projection,
     },
-    /// A field of view is wider or higher than the surface draws.
+    /// The requested field of view exceeds that of the projection.
     #[error(
         "a field of view of {degrees:.1} degrees is more than the {most:.1} that the {projection} projection draws"
     )]
     FieldTooWide {
-        /// The field, in degrees.
+        /// The requested field of view, in degrees.
         degrees: f64,
-        /// The widest, in degrees.
+        /// The maximum, in degrees.
         most: f64,
         /// The surface.
         projection: Projection,
     },
-    /// No photograph shows anything of what was to be drawn.
+    /// No photograph overlaps the requested field of view.
     #[error("no photograph reaches into the field of view")]
     NothingInView,
-    /// A flat scene has no directions, and so no field of view.
+    /// A field of view was requested for a planar scene.
     #[error("the scene is flat: it has no field of view, no middle at an angle and no horizon")]
     FlatScene,
 }
 
-/// Where a panorama's pixels look: pixel (0, 0) lies at `origin` of the surface, whose middle is the Z axis of `frame · world`.
+/// Geometry of the panorama image: pixel (0, 0) is surface position `origin`; the surface is centered on the Z axis of `frame · world`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Canvas {
     /// The surface, never [`Projection::Auto`].
     pub projection: Projection,
-    /// Pixels per radian at the middle.
+    /// Pixels per radian at the center.
     pub scale: f64,
     /// Surface coordinates of pixel (0, 0).
     pub origin: Point2<f64>,
-    /// The alignment's world to the surface's frame.
+    /// Rotation from the world frame of the alignment to the surface frame.
     pub frame: Matrix3<f64>,
 }
 
 impl Canvas {
-    /// The world direction that a pixel of the panorama shows.
+    /// Returns the world direction of a panorama pixel.
     pub fn ray(&self, pixel: Point2<f64>) -> Vector3<f64> {
         let surface = Surface { projection: self.projection, scale: self.scale };
         self.frame.transpose() * surface.inverse(pixel + self.origin.coords)
     }
 
-    /// Where the panorama shows a world direction; `None` where its surface does not reach.
+    /// Projects a world direction to a panorama pixel; `None` outside the domain of the projection.
     pub fn pixel(&self, ray: &Vector3<f64>) -> Option<Point2<f64>> {
         let surface = Surface { projection: self.projection, scale: self.scale };
         surface.forward(&(self.frame * ray)).map(|p| p - self.origin.coords)
@@ -89,28 +89,28 @@ pub(crate) struct Placement {
     /// Index of the photograph.
     pub(crate) photo: usize,
     pub(crate) view: View,
-    /// Canvas pixels that the photograph may touch: left, top, right, bottom, the last two exclusive.
+    /// Bounding box of the photograph on the canvas.
     pub(crate) bounds: Bounds,
-    /// Surface coordinates of canvas pixel (0, 0). Differs by a full turn between two placements of one photograph.
+    /// Surface coordinates of canvas pixel (0, 0). Two placements of one photograph differ by a full turn.
     pub(crate) origin: Point2<f64>,
 }
 
-/// The canvas and everything on it.
+/// The canvas with its placements.
 #[derive(Debug, Clone)]
 pub(crate) struct Layout {
     pub(crate) surface: Surface,
     pub(crate) width: usize,
     pub(crate) height: usize,
-    /// A full turn: the right edge continues at the left one.
+    /// Whether the canvas spans 360°: the right edge continues at the left one.
     pub(crate) full_circle: bool,
     pub(crate) placements: Vec<Placement>,
     pub(crate) canvas: Canvas,
-    /// Whether photographs reach beyond what the surface draws.
+    /// Whether photographs extend beyond the maximum field of view of the projection.
     pub(crate) reaches_beyond: bool,
 }
 
 impl Layout {
-    /// Median of the square roots of the placements' areas, in pixels.
+    /// Returns the median over the placements of the square root of the area, in pixels.
     pub(crate) fn typical_side(&self) -> f64 {
         let mut sides: Vec<f64> =
             self.placements.iter().map(|p| ((p.bounds.width() * p.bounds.height()) as f64).sqrt()).collect();
@@ -119,14 +119,14 @@ impl Layout {
     }
 }
 
-/// A plane tilts up or down with its photographs from this pitch on; below it stands upright and keeps verticals parallel.
-const UPRIGHT_PITCH: f64 = 25.0 * PI / 180.0;
-/// Samples along each side of a photograph when its outline is drawn.
-const PER_SIDE: usize = 64;
+/// Pitch in radians up to which a plane stays upright, which keeps verticals parallel; beyond, it tilts with the photographs.
+const MAX_UPRIGHT_PITCH: f64 = 25.0 * PI / 180.0;
+/// Samples per side of a photograph's outline.
+const SAMPLES_PER_SIDE: usize = 64;
 
-/// Lays the canvas out.
+/// Lays out the canvas.
 ///
-/// `resolution` is the scale relative to the photographs (1: the median focal length in pixels is the pixels per radian).
+/// `resolution` is relative to the photographs (1: the median focal length in pixels is the scale in pixels per radian).
 pub(crate) fn layout(
     alignment: &Alignment,
     projection: Projection,
@@ -171,7 +171,7 @@ pub(crate) fn layout(
     }
 }
 
-/// Lays out what lies in a window of the surface: that of the field of view, or the widest that the surface draws.
+/// Lays out a window of the surface: the requested field of view, or the maximum of the projection.
 fn in_window(
     views: &[(usize, View)],
     surface: Surface,
@@ -194,9 +194,9 @@ fn in_window(
         Matrix3::identity()
     } else {
         let (gap, middle, pitch) = middle(views);
-        // Around the whole horizon the middle stays where the views' own middle is.
+        // A full circle keeps the center of the alignment.
         let middle = if gap * surface.scale < 1.0 { 0.0 } else { middle };
-        let pitch = if surface.period().is_none() && pitch.abs() > UPRIGHT_PITCH { -pitch } else { 0.0 };
+        let pitch = if surface.period().is_none() && pitch.abs() > MAX_UPRIGHT_PITCH { -pitch } else { 0.0 };
         framing.frame(middle, pitch)
     };
     let views: Vec<(usize, View)> =
@@ -206,7 +206,7 @@ fn in_window(
     let boxes = found.iter().flat_map(|s| &s.boxes).copied();
     let all = boxes.reduce(|a, b| a.joined(&b)).ok_or(LayoutError::NothingInView)?;
     let full_circle = surface.period().is_some_and(|period| all.max.x - all.min.x > period - 1.0);
-    // A side that was asked for lies around the middle to half a pixel; one that was not ends where the photographs do.
+    // A requested side is centered to half a pixel; otherwise the canvas ends with the photographs.
     let side = |asked: bool, half: f64, min: f64, max: f64| {
         if asked {
             let size = (2.0 * half).round().max(1.0);
@@ -233,7 +233,7 @@ fn in_window(
     Ok(Layout { surface, width: canvas_w, height: canvas_h, full_circle, placements, canvas, reaches_beyond })
 }
 
-/// The size of a canvas in whole pixels.
+/// Checks and rounds the size of the canvas.
 fn canvas_size(
     width: f64,
     height: f64,
@@ -246,7 +246,8 @@ fn canvas_size(
     Ok((width as usize, height as usize))
 }
 
-/// How wide the part of the horizon is that no view covers, the longitude opposite to its middle, and the latitude, downwards, half-way between the lowest and the highest point.
+/// Returns the width of the largest uncovered range of longitude, the longitude opposite its center, and the mean of the lowest and highest latitude
+/// (positive downwards), in radians.
 fn middle(views: &[(usize, View)]) -> (f64, f64, f64) {
     let sphere = Surface { projection: Projection::Spherical, scale: 1.0 };
     let outlines: Vec<Outline> = views.iter().filter_map(|(_, v)| outline(v, &sphere)).collect();
@@ -256,17 +257,17 @@ fn middle(views: &[(usize, View)]) -> (f64, f64, f64) {
     (gap, opposite + PI, 0.5 * (low + high))
 }
 
-/// Outline of a view on a surface with longitudes unrolled along it: left, top, right, bottom in surface pixels.
+/// Bounding box of a view on the surface in surface pixels, with longitudes unwrapped.
 struct Outline {
     min: Point2<f64>,
     max: Point2<f64>,
 }
 
-/// The outline of a view; `None` where part of its border falls where the surface does not reach.
+/// Computes the outline of a view; `None` where its border leaves the domain of the projection.
 fn outline(view: &View, surface: &Surface) -> Option<Outline> {
     let axis = surface.forward(&view.ray(Point2::new(view.camera.cx, view.camera.cy))?)?;
     let (mut min, mut max) = (axis, axis);
-    let mut border = view.border(PER_SIDE);
+    let mut border = view.border(SAMPLES_PER_SIDE);
     border.extend(border.first().copied());
     let (mut first, mut last) = (None, axis.x);
     for pixel in border {
@@ -280,7 +281,7 @@ fn outline(view: &View, surface: &Surface) -> Option<Outline> {
         max = Point2::new(max.x.max(p.x), max.y.max(p.y));
     }
     if let (Some(period), Some(first)) = (surface.period(), first) {
-        // A border that goes once around the vertical has a pole inside.
+        // A border that winds around the vertical encloses a pole.
         if (last - first).abs() > 0.5 * period || max.x - min.x > 0.98 * period {
             if !surface.holds_poles() {
                 return None;
@@ -296,7 +297,7 @@ fn outline(view: &View, surface: &Surface) -> Option<Outline> {
     Some(Outline { min, max })
 }
 
-/// The horizontal angle that all views span together, and the largest vertical angle from the horizon.
+/// Computes the horizontal field of view of all views, and their largest latitude, in radians.
 fn extent(views: &[(usize, View)], scale: f64) -> (f64, f64) {
     let sphere = Surface { projection: Projection::Spherical, scale };
     let outlines: Vec<Outline> = views.iter().filter_map(|(_, v)| outline(v, &sphere)).collect();
@@ -305,14 +306,14 @@ fn extent(views: &[(usize, View)], scale: f64) -> (f64, f64) {
     (TAU - gap / scale, up)
 }
 
-/// The widest range of longitude that no outline covers, and the longitude of its middle.
+/// Returns the width and center of the largest range of longitude that no outline covers.
 fn largest_gap(outlines: &[Outline], period: f64) -> (f64, f64) {
     let wrap = |x: f64| x.rem_euclid(period);
     let mut intervals: Vec<(f64, f64)> = outlines.iter().map(|o| (wrap(o.min.x), o.max.x - o.min.x)).collect();
     intervals.sort_by(|a, b| a.0.total_cmp(&b.0));
     let mut best = (0.0, 0.0);
     let Some(first) = intervals.first().copied() else { return (period, 0.0) };
-    // Twice around, so that what reaches over the start is seen.
+    // Two turns, for intervals across the start.
     let mut reach = first.0 + first.1;
     for turn in 0..2 {
         for &(start, length) in &intervals {
@@ -333,7 +334,7 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
         LayoutError::TooWide { degrees, projection: surface.projection }
     };
     let mut frame = Matrix3::identity();
-    // The middle of the panorama goes to the Z axis.
+    // The center of the panorama is rotated to the Z axis.
     let mut recentered = |m: Matrix3<f64>| -> Vec<(usize, View)> {
         frame = m;
         views.iter().map(|&(i, v)| (i, View { from_world: v.from_world * m.transpose(), ..v })).collect()
@@ -347,7 +348,7 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
                 return Err(too_wide());
             }
             let level = turn(middle);
-            let tilt = if pitch.abs() > UPRIGHT_PITCH {
+            let tilt = if pitch.abs() > MAX_UPRIGHT_PITCH {
                 Rotation3::from_axis_angle(&Vector3::x_axis(), pitch).into_inner()
             } else {
                 Matrix3::identity()
@@ -359,7 +360,7 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
             let outlines = outlines.ok_or_else(too_wide)?;
             let (gap, middle) = largest_gap(&outlines, period);
             full_circle = gap < 1.0;
-            // Around the whole horizon the middle stays where the views' own middle is.
+            // A full circle keeps the center of the alignment.
             if full_circle { views.to_vec() } else { recentered(turn(middle / surface.scale + PI)) }
         }
     };
@@ -367,7 +368,7 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
     let mut outlines = outlines.ok_or_else(too_wide)?;
     if let Some(period) = surface.period() {
         for o in &mut outlines {
-            // The outline starts at the axis' longitude in (−π, π]; the gap opposite to the middle is at ±π.
+            // The outline starts at the longitude of the optical axis in (−π, π]; the gap is at ±π.
             let middle = 0.5 * (o.min.x + o.max.x);
             let shift = -(middle / period).round() * period;
             o.min.x += shift;
@@ -395,7 +396,7 @@ fn on_surface(views: &[(usize, View)], surface: Surface, flat: bool, max_pixels:
         for turns in turns {
             let shift = turns * surface.period().unwrap_or(0.0);
             let clamp = |v: f64, limit: usize| v.clamp(0.0, limit as f64) as usize;
-            // A pixel of slack for the curvature of the outline between its samples.
+            // A margin of one pixel for the curvature of the outline between its samples.
             let bounds = Bounds {
                 left: clamp((o.min.x + shift - origin.x).floor() - 1.0, canvas_w),
                 top: clamp((o.min.y - origin.y).floor() - 1.0, canvas_h),

@@ -1,6 +1,6 @@
-//! Mercator's projection: longitude by the integral of 1/cos over latitude, a cylinder without distortion of shapes.
+//! The Mercator projection: longitude by the integral of 1/cos over latitude, a conformal cylinder.
 //!
-//! `x = λ`, `y = asinh(tan φ)`, and back `ray = (sin x, sinh y, cos x)` (Snyder 1987, *Map Projections, a Working Manual*, §7). Verticals stay straight, angles stay angles, and heights
+//! `x = λ`, `y = asinh(tan φ)`, and back `ray = (sin x, sinh y, cos x)` (Snyder 1987, *Map Projections, a Working Manual*, §7). Verticals stay straight, angles are preserved, and heights
 //! are stretched less than by a cylinder.
 
 use super::Model;

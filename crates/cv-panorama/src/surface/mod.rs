@@ -1,6 +1,6 @@
-//! The canvas: surfaces to draw on, the place of each photograph on them, and the drawing of it.
+//! Projection surfaces, canvas layout, local alignment and warping.
 //!
-//! A projection is one file of this folder with a `Model`, and a variant of [`Projection`] with its name and its line in `SURFACES`.
+//! A projection is one file of this module with a `Model`, a variant of [`Projection`] with its name, and an entry of `SURFACES`.
 
 mod bounds;
 mod correlation;
@@ -19,7 +19,7 @@ mod stereographic;
 mod warp;
 
 pub use bounds::Bounds;
-pub(crate) use correlation::{PAD, PLACES, REACH, Template};
+pub(crate) use correlation::{PAD, SEARCH_RADIUS, SEARCH_SIDE, Template};
 pub(crate) use crop::largest_rectangle;
 pub(crate) use displacement::DisplacementField;
 pub use displacement::PhotoMap;
@@ -27,31 +27,31 @@ pub(crate) use elastic::displacements;
 pub use framing::Framing;
 pub use layout::{Canvas, LayoutError};
 pub(crate) use layout::{Layout, Placement, layout};
-pub(crate) use preview::{Piece, Preview, box_shrunk, shrunk_view};
+pub(crate) use preview::{Piece, Preview, downsample_box, downsampled_view};
 pub use warp::WarpedPhoto;
 pub(crate) use warp::{CLIPPED, Map, WarpSettings, warp};
 
 use cv_core::{Point2, Vector3, named};
 
-/// The surface a panorama is drawn on.
+/// Projection of the panorama.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize))]
 pub enum Projection {
-    /// [`Plane`](Self::Plane) while the field of view permits, else [`Cylindrical`](Self::Cylindrical), and
-    /// [`Spherical`](Self::Spherical) where it is also too high for a cylinder.
+    /// [`Plane`](Self::Plane) for narrow fields of view, else [`Cylindrical`](Self::Cylindrical), and
+    /// [`Spherical`](Self::Spherical) where the vertical field of view is too large for a cylinder.
     #[default]
     Auto,
-    /// A plane, as a camera with a wide lens would see it: straight lines stay straight. Under 180°.
+    /// Rectilinear: straight lines stay straight. Under 180°.
     Plane,
-    /// A vertical cylinder: verticals stay straight, any width.
+    /// Vertical cylinder: verticals stay straight, any width.
     Cylindrical,
-    /// A sphere, longitude by latitude: any width and height.
+    /// Equirectangular, longitude by latitude: any width and height.
     Spherical,
-    /// Mercator's: as a cylinder, with heights stretched so that shapes stay as they are. Drawn up to 85° from the horizon.
+    /// Mercator: a conformal cylinder. Up to 85° from the horizon.
     Mercator,
-    /// Pannini's, a wide view as painters draw it: verticals and lines towards the middle stay straight. Drawn up to 120° to each side.
+    /// Pannini: verticals and lines toward the center stay straight. Up to 120° to each side.
     Panini,
-    /// Stereographic: shapes stay as they are, around the middle and far beyond; the "little planet" with the middle straight down. Drawn up to 150° from the middle.
+    /// Stereographic: conformal; the "little planet" if centered at the nadir. Up to 150° from the center.
     Stereographic,
 }
 
@@ -65,37 +65,37 @@ named!(Projection {
     Stereographic = "stereographic",
 });
 
-/// A surface, in units of its scale: world directions to surface coordinates, the Z axis at (0, 0).
+/// A projection in units of its scale: world directions to surface coordinates, the Z axis at (0, 0).
 ///
-/// All factor as `ray = (g·ax, b, g·az + c)`: `ax` and `az` depend on x alone, `g`, `b` and `c` on y alone, so that warping needs no trigonometry per
-/// pixel.
+/// The inverse factors as `ray = (g·ax, b, g·az + c)`: `ax` and `az` depend on x alone, `g`, `b` and `c` on y alone, so that warping needs no
+/// trigonometry per pixel.
 trait Model: Sync {
-    /// Where the direction falls, times the scale; `None` for directions the surface does not hold. Longitude is in (−π, π] times the scale.
+    /// Projects a direction, times the scale; `None` outside the domain. Longitude is in (−π, π] times the scale.
     fn forward(&self, ray: &Vector3<f64>, scale: f64) -> Option<Point2<f64>>;
 
-    /// `ax` and `az` at x.
+    /// Returns `ax` and `az` at x.
     fn column(&self, x: f64) -> (f64, f64);
 
-    /// `g`, `b` and `c` at y.
+    /// Returns `g`, `b` and `c` at y.
     fn row(&self, y: f64) -> (f64, f64, f64);
 
-    /// Whether x is the longitude, so that the surface closes after 2π.
+    /// Returns whether x is the longitude, with period 2π.
     fn is_periodic(&self) -> bool;
 
-    /// Whether the directions straight up and down lie on it.
+    /// Returns whether the zenith and nadir are in the domain.
     fn holds_poles(&self) -> bool;
 
-    /// The field that is drawn at the most, in radians, across (through the middle) and up: what lies beyond is so far out, and so enlarged, that nobody has a use for it.
+    /// Returns the maximum field of view in radians, horizontal (through the center) and vertical; magnification is excessive beyond.
     fn field(&self) -> [f64; 2];
 
-    /// Whether directions that photographs may well show lie at infinity: it is always drawn up to its field only.
+    /// Returns whether the projection diverges within usual fields of view, so that the canvas is always limited to its field.
     fn diverges(&self) -> bool;
 
-    /// Whether it distorts little enough for views that span `across` horizontally and reach `up` from the horizon, in radians.
+    /// Returns whether the distortion is acceptable for views that span `across` horizontally and `up` from the horizon, in radians.
     fn suits(&self, across: f64, up: f64) -> bool;
 }
 
-/// Every surface, in the order in which they are preferred. Those that suit nothing come last: they are chosen by people only.
+/// All surfaces in order of preference. Those that are never chosen automatically come last.
 const SURFACES: [(Projection, &dyn Model); 6] = [
     (Projection::Plane, &plane::Plane),
     (Projection::Cylindrical, &cylindrical::Cylindrical),
@@ -106,17 +106,17 @@ const SURFACES: [(Projection, &dyn Model); 6] = [
 ];
 
 impl Projection {
-    /// The surfaces that suit views of this extent, the preferred one first.
+    /// Returns the suitable projections for views of this extent, the preferred one first.
     fn suitable(across: f64, up: f64) -> impl Iterator<Item = Self> {
         SURFACES.iter().filter(move |(_, model)| model.suits(across, up)).map(|(projection, _)| *projection)
     }
 
-    /// The widest field that is drawn, in radians: across and up. That of a plane for [`Projection::Auto`].
+    /// Returns the maximum field of view in radians, horizontal and vertical. That of a plane for [`Projection::Auto`].
     pub fn widest_field(self) -> [f64; 2] {
         self.model().field()
     }
 
-    /// The surface; a plane for [`Projection::Auto`], which is none.
+    /// Returns the surface; a plane for [`Projection::Auto`].
     fn model(self) -> &'static dyn Model {
         SURFACES.iter().find(|(projection, _)| *projection == self).map_or(&plane::Plane, |(_, model)| *model)
     }
@@ -126,43 +126,43 @@ impl Projection {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Surface {
     pub(crate) projection: Projection,
-    /// Pixels per radian at the middle of the panorama.
+    /// Pixels per radian at the center of the panorama.
     pub(crate) scale: f64,
 }
 
 impl Surface {
-    /// Where the direction falls; `None` for directions the surface does not hold. Longitude is in (−π, π] times the scale.
+    /// Projects a direction; `None` outside the domain. Longitude is in (−π, π] times the scale.
     pub(crate) fn forward(&self, ray: &Vector3<f64>) -> Option<Point2<f64>> {
         self.projection.model().forward(ray, self.scale)
     }
 
-    /// The direction at a point of the surface.
+    /// Returns the direction at a point of the surface.
     pub(crate) fn inverse(&self, p: Point2<f64>) -> Vector3<f64> {
         let (ax, az) = self.column(p.x);
         let (g, b, c) = self.row(p.y);
         Vector3::new(g * ax, b, g * az + c)
     }
 
-    /// `ax` and `az` of `ray = (g·ax, b, g·az + c)` at x ...
+    /// Returns `ax` and `az` of `ray = (g·ax, b, g·az + c)` at x.
     pub(crate) fn column(&self, x: f64) -> (f64, f64) {
         self.projection.model().column(x / self.scale)
     }
 
-    /// ... and `g`, `b` and `c` at y.
+    /// Returns `g`, `b` and `c` at y.
     pub(crate) fn row(&self, y: f64) -> (f64, f64, f64) {
         self.projection.model().row(y / self.scale)
     }
 
-    /// Surface width of a full turn, where there is one.
+    /// Returns the surface width of a full turn, where the surface is periodic.
     pub(crate) fn period(&self) -> Option<f64> {
         self.projection.model().is_periodic().then_some(std::f64::consts::TAU * self.scale)
     }
 
-    /// Half the width and height, in pixels, of a field of view of these angles, in radians; `None` where it is wider or higher than the surface draws.
+    /// Returns half the width and height, in pixels, of a field of view in radians; `None` where it exceeds the maximum.
     pub(crate) fn half_size(&self, across: f64, up: f64) -> [Option<f64>; 2] {
         let most = self.projection.model().field();
         let half = |angle: f64, most: f64, ray: Vector3<f64>, of: fn(Point2<f64>) -> f64| {
-            // Degrees that people type come with a rounding.
+            // Tolerance for angles converted from degrees.
             let p = self.forward(&ray).filter(|_| angle > 0.0 && angle <= most + 1e-9)?;
             Some(of(p).abs()).filter(|half| half.is_finite() && *half > 0.0)
         };
@@ -173,12 +173,12 @@ impl Surface {
         ]
     }
 
-    /// Whether it is always drawn up to its widest field only.
+    /// Returns whether the canvas is always limited to the maximum field of view.
     pub(crate) fn diverges(&self) -> bool {
         self.projection.model().diverges()
     }
 
-    /// Whether the directions straight up and down lie on the surface.
+    /// Returns whether the zenith and nadir are in the domain.
     pub(crate) fn holds_poles(&self) -> bool {
         self.projection.model().holds_poles()
     }

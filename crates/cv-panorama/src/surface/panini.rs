@@ -1,7 +1,7 @@
 //! The general Pannini projection at d = 1 (Sharpless, Postle & German 2010, *Pannini: A New Projection for Rendering Wide Angle Perspective Images*): a
-//! cylinder seen from the point of it that lies opposite to the middle.
+//! cylinder projected from its point opposite the center.
 //!
-//! With longitude λ and latitude φ: `S = 2 / (1 + cos λ)`, `x = S sin λ = 2 tan(λ/2)`, `y = S tan φ`. Verticals stay straight, and so does every line that runs towards the middle. With
+//! With longitude λ and latitude φ: `S = 2 / (1 + cos λ)`, `x = S sin λ = 2 tan(λ/2)`, `y = S tan φ`. Verticals stay straight, and so does every line toward the center. With
 //! `h = hypot(X, Z)`: `(x, y) = 2 (X, Y) / (h + Z)`, and back `ray = (x, y, 1 − x² / 4)`.
 
 use super::Model;

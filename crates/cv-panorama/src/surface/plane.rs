@@ -1,4 +1,4 @@
-//! A plane at right angles to the Z axis: the perspective projection.
+//! A plane orthogonal to the Z axis: the perspective (rectilinear) projection.
 
 use super::Model;
 use cv_core::{Point2, Vector3};

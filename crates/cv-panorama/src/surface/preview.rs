@@ -1,14 +1,14 @@
-//! The canvas at a fraction of its size, where exposure and seams are decided.
+//! The canvas at reduced resolution, on which exposure compensation and seam finding run.
 
 use crate::align::View;
-use crate::light::{ExposureCorrection, Gains, UNREADABLE};
-use crate::rows::asks;
+use crate::photometric::{ExposureCorrection, Gains, SATURATED_LEVEL};
+use crate::rows::is_check_due;
 use crate::surface::{Bounds, DisplacementField, Layout, Map, Placement, Surface, WarpSettings, WarpedPhoto, warp};
 use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Scaling, Stage};
 use cv_imgproc::Interpolation;
 use rayon::prelude::*;
 
-/// Every placement drawn at one `1 / step` of the canvas.
+/// All placements warped at `1 / step` of the canvas resolution.
 pub(crate) struct Preview {
     /// Canvas pixels per preview pixel.
     pub(crate) step: usize,
@@ -18,19 +18,19 @@ pub(crate) struct Preview {
     pub(crate) pieces: Vec<Piece>,
 }
 
-/// A placement on the preview.
+/// A placement warped to the preview.
 pub(crate) struct Piece {
     pub(crate) warped: WarpedPhoto,
-    /// Square of each pixel's distance from the photograph's middle, measured so that it is 1 all along the border.
+    /// Squared Chebyshev distance of each pixel from the photograph's center, normalized to 1 along the border.
     pub(crate) eccentricity: Vec<f32>,
-    /// Square of each pixel's distance from the photograph's middle, 1 at the corners.
+    /// Squared Euclidean distance of each pixel from the photograph's center, normalized to 1 at the corners.
     pub(crate) radius: Vec<f32>,
-    /// Where the photograph is clipped in a channel.
+    /// Whether the photograph is clipped in a channel.
     pub(crate) clipped: Vec<bool>,
 }
 
 impl Piece {
-    /// The blocks of two by two pixels that lie wholly within the bounds; reached where all four are.
+    /// Averages blocks of 2 × 2 pixels that lie completely within the bounds; covered where all four are.
     fn halved(&self) -> Self {
         let (b, pixels) = (self.warped.bounds, &self.warped.pixels);
         let (left, top) = (b.left.div_ceil(2), b.top.div_ceil(2));
@@ -61,7 +61,7 @@ impl Piece {
 }
 
 impl Preview {
-    /// Draws the preview with at most about `max_pixels` pixels.
+    /// Warps all placements to a preview of about `max_pixels` pixels at most.
     pub(crate) fn draw(
         photos: &[ImageView<'_, u8, 3>],
         layout: &Layout,
@@ -76,18 +76,18 @@ impl Preview {
         let s = 1.0 / step as f64;
         let surface = Surface { scale: layout.surface.scale * s, ..layout.surface };
         let (width, height) = (layout.width.div_ceil(step), layout.height.div_ceil(step));
-        // A photograph drawn smaller is averaged first, or fine texture would alias.
+        // Box filter against aliasing.
         let shrink = ((step as f64 / resolution.max(1e-9)).round() as usize).max(1);
         let small = |(i, photo): (usize, &ImageView<'_, u8, 3>)| {
             let is_placed = layout.placements.iter().any(|p| p.photo == i);
-            let small = is_placed.then(|| box_shrunk(*photo, shrink, &stage)).transpose()?;
+            let small = is_placed.then(|| downsample_box(*photo, shrink, &stage)).transpose()?;
             stage.add(1)?;
             Ok(small)
         };
         let small: Vec<Option<RgbU8>> = photos.par_iter().enumerate().map(small).collect::<Result<_, Cancelled>>()?;
         let draw = |(k, p): (usize, &Placement)| {
             let Some(Some(photo)) = small.get(p.photo) else { return Ok(None) };
-            // Where the surface's origin lies among the canvas pixels is −origin.
+            // The surface origin is canvas position −origin.
             let origin = -Scaling::uniform(s).point(-p.origin);
             let bounds = Bounds {
                 left: p.bounds.left / step,
@@ -96,7 +96,7 @@ impl Preview {
                 bottom: p.bounds.bottom.div_ceil(step).min(height),
             };
             let field = fields.get(k).and_then(Option::as_ref).map(|f| f.scaled(s, 1.0 / shrink as f64));
-            let view = shrunk_view(p, shrink, photo.size());
+            let view = downsampled_view(p, shrink, photo.size());
             let small = Placement { view, bounds, origin, ..*p };
             let settings =
                 WarpSettings { displacement: field.as_ref(), interpolation: Interpolation::Bilinear, correction: None };
@@ -104,7 +104,7 @@ impl Preview {
             let (eccentricity, radius) = distances(&small, &surface);
             stage.add(1)?;
             let pixels = warped.pixels.as_slice().as_chunks::<4>().0.iter();
-            let clipped = pixels.map(|p| p[..3].iter().any(|v| *v >= UNREADABLE)).collect();
+            let clipped = pixels.map(|p| p[..3].iter().any(|v| *v >= SATURATED_LEVEL)).collect();
             Ok(Some(Piece { warped, eccentricity, radius, clipped }))
         };
         let pieces: Vec<Option<Piece>> =
@@ -112,37 +112,37 @@ impl Preview {
         Ok(Self { step, width, height, pieces: pieces.into_iter().flatten().collect() })
     }
 
-    /// Evens out the exposure of every piece.
+    /// Applies the exposure correction to every piece.
     pub(crate) fn correct(&mut self, gains: &Gains, photo_of: &[usize]) {
         let tone = gains.tone(1);
         self.pieces.par_iter_mut().zip(photo_of).for_each(|(piece, &photo)| {
             let correction = ExposureCorrection::new(&tone, gains, photo);
             let pixels = piece.warped.pixels.as_mut_slice().as_chunks_mut::<4>().0;
             for (p, r2) in pixels.iter_mut().zip(&piece.radius) {
-                let color = correction.levels([p[0], p[1], p[2]].map(f32::from), correction.lift(*r2));
+                let color = correction.levels([p[0], p[1], p[2]].map(f32::from), correction.vignetting_stops(*r2));
                 let [r, g, b] = color.map(|v| (v + 0.5) as u8);
                 *p = [r, g, b, p[3]];
             }
         });
     }
 
-    /// The same at half the size.
+    /// Returns the preview at half resolution.
     pub(crate) fn halved(&self) -> Self {
         let pieces = self.pieces.par_iter().map(Piece::halved).collect();
         Self { step: 2 * self.step, width: self.width / 2, height: self.height / 2, pieces }
     }
 }
 
-/// A placement's view of the photograph that [`box_shrunk`] made, of this size.
-pub(crate) fn shrunk_view(p: &Placement, shrink: usize, size: (usize, usize)) -> View {
+/// Returns the view of a photograph downsampled by [`downsample_box`] to this size.
+pub(crate) fn downsampled_view(p: &Placement, shrink: usize, size: (usize, usize)) -> View {
     let mut view = p.view.scaled(1.0 / shrink as f64);
-    // The blocks at the right and bottom that were not whole are gone.
+    // Incomplete blocks at the right and bottom are dropped.
     (view.camera.width, view.camera.height) = size;
     view
 }
 
-/// Means of `step × step` blocks; incomplete blocks at the right and bottom are dropped unless nothing would be left.
-pub(crate) fn box_shrunk(photo: ImageView<'_, u8, 3>, step: usize, stage: &Stage<'_>) -> Result<RgbU8, Cancelled> {
+/// Averages blocks of `step × step` pixels; incomplete blocks at the right and bottom are dropped unless nothing would be left.
+pub(crate) fn downsample_box(photo: ImageView<'_, u8, 3>, step: usize, stage: &Stage<'_>) -> Result<RgbU8, Cancelled> {
     if step == 1 {
         return Ok(photo.to_image());
     }
@@ -152,7 +152,7 @@ pub(crate) fn box_shrunk(photo: ImageView<'_, u8, 3>, step: usize, stage: &Stage
     let area = (bw * bh) as u32;
     let mut sums = vec![0_u32; 3 * width];
     for y in 0..height {
-        if asks(y, 3 * photo.width() * bh) {
+        if is_check_due(y, 3 * photo.width() * bh) {
             stage.check()?;
         }
         sums.fill(0);
@@ -173,7 +173,7 @@ pub(crate) fn box_shrunk(photo: ImageView<'_, u8, 3>, step: usize, stage: &Stage
     Ok(small)
 }
 
-/// Both distances of every pixel from the middle of its photograph.
+/// Computes `eccentricity` and `radius` of a [`Piece`].
 fn distances(p: &Placement, surface: &Surface) -> (Vec<f32>, Vec<f32>) {
     let map = Map::new(p, surface, p.bounds);
     let (w, h) = (p.bounds.width(), p.bounds.height());
@@ -277,7 +277,7 @@ mod tests {
     #[test]
     fn shrinking_keeps_means_and_something_of_every_photograph() {
         let photo = RgbU8::from_fn(5, 3, |x, _| [(10 * x) as u8, 0, 255]);
-        assert_eq!(box_shrunk(photo.view(), 2, &stage()).unwrap().as_slice(), [5, 0, 255, 25, 0, 255]);
-        assert_eq!(box_shrunk(photo.view(), 100, &stage()).unwrap().as_slice(), [20, 0, 255]);
+        assert_eq!(downsample_box(photo.view(), 2, &stage()).unwrap().as_slice(), [5, 0, 255, 25, 0, 255]);
+        assert_eq!(downsample_box(photo.view(), 100, &stage()).unwrap().as_slice(), [20, 0, 255]);
     }
 }

@@ -1,6 +1,6 @@
-//! The stereographic projection: a sphere seen from the point opposite to its middle, the "little planet" where the middle lies straight down.
+//! The stereographic projection: a sphere projected from its point opposite the center, the "little planet" if centered at the nadir.
 //!
-//! A direction at an angle θ from the Z axis lies 2 tan(θ/2) from the middle, in its own direction: circles stay circles and angles stay angles (Snyder 1987, *Map
+//! A direction at an angle θ from the Z axis maps to distance 2 tan(θ/2) from the center: circles map to circles, and the projection is conformal (Snyder 1987, *Map
 //! Projections, a Working Manual*, §21). With `n = |ray|`: `(x, y) = 2 (X, Y) / (n + Z)`, and back `ray = (x, y, 1 − (x² + y²) / 4)`.
 
 use super::Model;

@@ -1,35 +1,35 @@
-//! Drawing a photograph onto the canvas.
+//! Warping of a photograph to the canvas.
 //!
-//! All surfaces factor as `ray = (g(y)·ax(x), b(y), g(y)·az(x) + c(y))` (see `Model`), so a canvas pixel's place in the photograph
-//! costs three multiply-adds per coordinate and one division.
+//! All surfaces factor as `ray = (g(y)·ax(x), b(y), g(y)·az(x) + c(y))` (see `Model`), so mapping a canvas pixel to the photograph takes three
+//! multiply-adds per coordinate and one division.
 
 use crate::align::View;
-use crate::depth::Channel;
-use crate::light::ExposureCorrection;
+use crate::bit_depth::Channel;
+use crate::photometric::ExposureCorrection;
 use crate::rows::for_each_row_with;
 use crate::surface::{Bounds, DisplacementField, Placement, Surface};
 use cv_core::{Cancelled, DistortionModel, Image, ImageView, Matrix3, Point2, Sample, Stage};
 use cv_imgproc::{Interpolation, bilinear_at};
 use fearless_simd::{Level, Simd, dispatch};
 
-/// A photograph drawn on a part of the canvas.
+/// A photograph warped to a part of the canvas.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WarpedPhoto<T = u8> {
     /// The part of the canvas.
     pub bounds: Bounds,
-    /// Red, green, blue, and white (255 or 65535) where the photograph reaches (0 where its edge pixels were repeated instead); of the size of the bounds.
+    /// Red, green, blue, and opacity: the maximum value where the photograph covers the pixel, 0 where its border pixels are replicated; of the size of the bounds.
     pub pixels: Image<T, 4>,
 }
 
 impl<T: Sample> WarpedPhoto<T> {
-    /// Whether the photograph reaches a canvas pixel.
+    /// Returns whether the photograph covers a canvas pixel.
     #[inline]
     pub fn reaches(&self, x: usize, y: usize) -> bool {
         let b = self.bounds;
         b.contains(x, y) && self.pixels.row(y - b.top)[4 * (x - b.left) + 3] != T::default()
     }
 
-    /// The color at a canvas pixel; `None` where the photograph does not reach.
+    /// Returns the color at a canvas pixel; `None` where the photograph does not cover it.
     #[inline]
     pub fn color(&self, x: usize, y: usize) -> Option<[T; 3]> {
         let b = self.bounds;
@@ -41,19 +41,19 @@ impl<T: Sample> WarpedPhoto<T> {
     }
 }
 
-/// Opacity of linear light that is a bound: the photograph is clipped there.
+/// Opacity of linear radiance that is a lower bound because the photograph is clipped.
 pub(crate) const CLIPPED: f32 = 0.5;
 
-/// How a photograph is drawn.
+/// Settings of [`warp`].
 #[derive(Clone, Copy)]
 pub(crate) struct WarpSettings<'a> {
     pub(crate) displacement: Option<&'a DisplacementField>,
     pub(crate) interpolation: Interpolation,
-    /// What is done to its light; `None` for nothing.
+    /// Exposure correction; `None` for none.
     pub(crate) correction: Option<ExposureCorrection<'a>>,
 }
 
-/// The photograph as seen in the canvas pixels `bounds`.
+/// Warps a photograph to the canvas pixels `bounds`.
 pub(crate) fn warp<T: Channel>(
     photo: ImageView<'_, T, 3>,
     placement: &Placement,
@@ -69,7 +69,7 @@ pub(crate) fn warp<T: Channel>(
     }
     let map = Map::new(placement, surface, bounds);
     let correction = settings.correction;
-    // Plain loops compiled for each instruction set; without fused multiply-adds all give the same bytes.
+    // Plain loops compiled for each instruction set; without fused multiply-adds results are identical.
     let level = Level::new();
     for_each_row_with(
         pixels.as_mut_slice(),
@@ -98,11 +98,11 @@ pub(crate) fn warp<T: Channel>(
     Ok(WarpedPhoto { bounds, pixels })
 }
 
-/// Canvas pixels to photograph pixels, row by row.
+/// Map from canvas pixels to photograph pixels, evaluated by rows.
 pub(crate) struct Map {
     /// Per column, the part of `M · ray` that depends on x.
     columns: Vec<[f32; 3]>,
-    /// The middle and the last column of M, times b(y) and c(y) the part that depends on y alone.
+    /// Second and third column of M; times b(y) and c(y) they are the part that depends on y alone.
     middle: [f64; 3],
     last: [f64; 3],
     surface: Surface,
@@ -112,11 +112,11 @@ pub(crate) struct Map {
 }
 
 enum Lens {
-    /// M already ends in pixels.
+    /// No distortion: M maps to pixels.
     None,
-    /// M ends in normalized coordinates; beyond `limit` (squared radius) no pixel of the photograph lies.
+    /// M maps to normalized coordinates; `limit` is the largest squared radius inside the photograph.
     Radial { k1: f32, k2: f32, f: [f32; 2], c: [f32; 2], limit: f32 },
-    /// As above, by the camera's own functions.
+    /// As above, with the functions of the camera model.
     Other { view: View, limit: f32 },
 }
 
@@ -124,12 +124,12 @@ impl Map {
     pub(crate) fn new(placement: &Placement, surface: &Surface, bounds: Bounds) -> Self {
         let view = placement.view;
         let camera = view.camera;
-        // How far from the axis the photograph's own border lies, with a margin for the border pixels' outer halves.
+        // Largest squared radius of the photograph's border, with a margin for the outer halves of the border pixels.
         let limit = || {
             let squared = view.border(64).into_iter().map(|p| camera.normalize(p).coords.norm_squared());
             1.05 * squared.filter(|v| v.is_finite()).fold(0.0, f64::max) as f32
         };
-        // The radial lens has vector code here; all others go by the table.
+        // Radial distortion is vectorized here; other models use their own functions.
         let radial = camera.distortion.converted(DistortionModel::Radial);
         let (m, lens) = match radial.as_ref().map(|lens| lens.parameters()) {
             _ if camera.distortion.is_none() => (camera.matrix() * view.from_world, Lens::None),
@@ -145,7 +145,7 @@ impl Map {
             }
             _ => (view.from_world, Lens::Other { view, limit: limit() }),
         };
-        // The overall size of M cancels; one keeps the single-precision numbers in the middle of their range.
+        // The scale of M cancels; normalization keeps single precision well scaled.
         let m: Matrix3<f64> = m / m.norm();
         let columns = (bounds.left..bounds.right)
             .map(|x| {
@@ -158,14 +158,14 @@ impl Map {
         Self { columns, middle, last, surface: *surface, top: bounds.top as f64 + placement.origin.y, lens }
     }
 
-    /// Photograph coordinates of row `y` of the bounds. What lies behind the camera comes out far outside the photograph.
+    /// Computes the photograph coordinates of row `y` of the bounds. Rays behind the camera map far outside the photograph.
     #[inline(always)]
     pub(crate) fn row(&self, y: usize, us: &mut [f32], vs: &mut [f32]) {
         let (g, b, c) = self.surface.row(self.top + y as f64);
         let g = g as f32;
         let b: [f32; 3] = std::array::from_fn(|r| (self.middle[r] * b + self.last[r] * c) as f32);
         for ((c, u), v) in self.columns.iter().zip(us.iter_mut()).zip(vs.iter_mut()) {
-            // At and behind the camera's plane: far out in the direction in which the ray leaves.
+            // Rays at and behind the principal plane map far outside.
             let z = (g * c[2] + b[2]).max(1e-9);
             let inverse = 1.0 / z;
             *u = (g * c[0] + b[0]) * inverse;
@@ -176,10 +176,10 @@ impl Map {
             Lens::Radial { k1, k2, f, c, limit } => {
                 for (u, v) in us.iter_mut().zip(vs.iter_mut()) {
                     let r2 = (*u * *u + *v * *v).max(1e-30);
-                    // Beyond the photograph the polynomial may fold back: hold it at the border.
+                    // Outside the photograph the polynomial may not be monotonic: the radius is clamped.
                     let r2_held = r2.min(*limit);
                     let factor = (1.0 + r2_held * (k1 + k2 * r2_held)) * (r2_held / r2).sqrt();
-                    // A point that was held belongs to no pixel, however the corners of the photograph lie.
+                    // Clamped points map outside the photograph.
                     let out = if r2 > *limit { 1e6 } else { 0.0 };
                     *u = f[0] * factor * *u * (1.0 + out) + c[0];
                     *v = f[1] * factor * *v * (1.0 + out) + c[1];
@@ -200,13 +200,13 @@ impl Map {
     }
 }
 
-/// What is known of a row of the canvas, pixel by pixel.
+/// Scratch buffers of a canvas row.
 struct Row {
     /// Photograph coordinates.
     us: Vec<f32>,
     vs: Vec<f32>,
     colors: [Vec<f32>; 3],
-    /// Stops by which the light is lifted for its distance from the photograph's middle.
+    /// Vignetting correction in stops.
     lifts: Vec<f32>,
     clipped: Vec<f32>,
 }
@@ -218,8 +218,8 @@ impl Row {
     }
 }
 
-/// Samples one row; coordinates outside the photograph take the nearest edge pixel and are marked as not reached. One thing after the other, each in a loop
-/// that can be done in vectors but for the looking up.
+/// Samples one row; coordinates outside the photograph are clamped to its border and get opacity 0. One loop per step, so that all but the lookups are
+/// vectorized.
 #[inline(always)]
 fn sample_row<S: Simd, T: Channel, I: Sampler>(
     simd: S,
@@ -235,20 +235,20 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
     for ((pixel, u), v) in pixels.iter_mut().zip(us.iter_mut()).zip(vs.iter_mut()) {
         let inside = (*u >= -0.5) & (*v >= -0.5) & (*u <= right + 0.5) & (*v <= bottom + 0.5);
         pixel[3] = if inside { T::OPAQUE } else { T::default() };
-        // `max` first: it turns NaN into a number.
+        // `max` first: it replaces NaN.
         (*u, *v) = (u.max(0.0).min(right), v.max(0.0).min(bottom));
     }
     let places = pixels.iter().zip(us.iter().zip(vs.iter()));
     for (((place, r), g), b) in places.zip(reds.iter_mut()).zip(greens.iter_mut()).zip(blues.iter_mut()) {
         let (pixel, (&u, &v)) = place;
-        // Beyond the border there is nothing to be sharp about.
+        // Outside the border the nearest pixel suffices.
         [*r, *g, *b] =
             if pixel[3] != T::default() { I::sample(simd, photo, u, v) } else { Nearest::sample(simd, photo, u, v) };
     }
     if let Some(correction) = &correction {
         for ((lift, &u), &v) in lifts.iter_mut().zip(us.iter()).zip(vs.iter()) {
             let (x, y) = (u - 0.5 * right, v - 0.5 * bottom);
-            *lift = correction.lift(corner * (x * x + y * y));
+            *lift = correction.vignetting_stops(corner * (x * x + y * y));
         }
         scale([reds, greens, blues], 1.0 / T::PER_LEVEL);
         if T::LINEAR {
@@ -260,7 +260,7 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
                     pixel[3] = T::from_f32(CLIPPED);
                 }
                 let lift = lift.exp2();
-                // The kernel overshoots at edges.
+                // The bicubic kernel overshoots at edges.
                 (*r, *g, *b) =
                     (r.max(0.0) * factors[0] * lift, g.max(0.0) * factors[1] * lift, b.max(0.0) * factors[2] * lift);
             }
@@ -276,7 +276,7 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
     }
 }
 
-/// From the unit of samples to that of levels, or back.
+/// Scales rows between sample units and gray levels.
 #[inline(always)]
 fn scale(rows: [&mut Vec<f32>; 3], factor: f32) {
     if factor != 1.0 {
@@ -284,15 +284,14 @@ fn scale(rows: [&mut Vec<f32>; 3], factor: f32) {
     }
 }
 
-/// The base pixel of a place inside the photograph, and the fractions beyond it.
+/// Splits a position inside the photograph into the base pixel and the fractional offsets.
 #[inline(always)]
 fn split(u: f32, v: f32) -> (usize, usize, f32, f32) {
     let (x, y) = (u as i32, v as i32);
     (x as usize, y as usize, u - x as f32, v - y as f32)
 }
 
-/// A kind of interpolation, at a place inside the photograph. (A type and not a function that is handed over: that would be called, and compiled for no
-/// instruction set in particular.)
+/// An interpolation kernel. (A type instead of a function pointer, so that it is inlined and compiled for each instruction set.)
 trait Sampler {
     fn sample<S: Simd, T: Channel>(simd: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3];
 }
@@ -329,7 +328,7 @@ impl Sampler for Bicubic {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::light::Gains;
+    use crate::photometric::Gains;
     use crate::surface::Projection;
     use crate::testing::stage;
     use cv_core::{Camera, Distortion, RgbU8, Vector3};
@@ -444,7 +443,7 @@ mod tests {
             }
             sum
         });
-        let levels = correction.levels(color.map(|v| v as f32), correction.lift(r2 as f32));
+        let levels = correction.levels(color.map(|v| v as f32), correction.vignetting_stops(r2 as f32));
         levels.map(|v| f64::from(v).clamp(0.0, 255.0))
     }
 

@@ -1,54 +1,54 @@
-//! From levels of a photograph to levels of the panorama: to light, by the photograph's exposure to the light of all, and back by the camera's own curve, so that the
-//! panorama looks as the photographs do. What the brightened photographs have above white is compressed, not cut off.
+//! Tone mapping from levels of a photograph to levels of the panorama: inverse response, exposure correction, then the camera's own response, so that the
+//! panorama looks like the photographs. Radiance above white is compressed instead of clipped.
 
-use crate::light::{Gains, Response};
+use crate::photometric::{Gains, Response};
 
-/// Entries per stop of light.
-const PER_STOP: f32 = 32.0;
-/// log₂ of the least light there is an entry for.
-const LEAST: f32 = -16.0;
-/// Entries per level of a photograph: to the nearest of them a level is rounded by a sixteenth at most.
-const PER_LEVEL: usize = 8;
-/// The level from which on there is room made for light above white.
+/// Table entries per stop.
+const ENTRIES_PER_STOP: f32 = 32.0;
+/// log₂ radiance of the first table entry.
+const MIN_LOG_RADIANCE: f32 = -16.0;
+/// Table entries per level of a photograph: quantizes levels to within a sixteenth.
+const ENTRIES_PER_LEVEL: usize = 8;
+/// Level above which highlights are compressed.
 const KNEE: f64 = 190.0;
 
-/// The curves that all photographs of a panorama share.
+/// Lookup tables shared by all photographs of a panorama.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Tone {
-    /// log₂ of light by level of a photograph, as a place among `levels`, the last one repeated.
-    light: Box<[f32; 2048]>,
-    /// Level of the panorama by log₂ of light, the last one repeated. (Lengths are powers of two, so that a mask bounds an index.)
+    /// log₂ radiance by level of a photograph, as a fractional index into `levels`; the last entry is repeated.
+    log_radiance: Box<[f32; 2048]>,
+    /// Level of the panorama by log₂ radiance; the last entry is repeated. (Lengths are powers of two, so that a mask bounds an index.)
     levels: Box<[f32; 1024]>,
 }
 
 impl Tone {
-    /// The curves for photographs of a response whose white may come to `highest` stops above white.
+    /// Builds the tables for a response and highlights of up to `highest` stops above white.
     ///
-    /// Above white the response goes on along its tangent in stops. Levels up to the knee stay; from there to that of `highest` they are compressed to 255 by a
-    /// rational curve of continuous slope (Reinhard et al., "Photographic tone reproduction for digital images", 2002, with a straight part).
+    /// Above white the response continues along its tangent. Levels up to the knee are unchanged; from there to the level of `highest` they are compressed to
+    /// 255 by a rational curve of continuous slope (Reinhard et al., "Photographic tone reproduction for digital images", 2002, with a linear part).
     ///
-    /// The response is found at so many `parts` of a level, 1 for bytes and [`PER_LEVEL`] at the most, and is linear in stops between.
+    /// The response is sampled at `parts` per level (1 for bytes, at most [`ENTRIES_PER_LEVEL`]) and interpolated linearly in stops.
     pub(crate) fn new(response: &Response, highest: f64, parts: usize) -> Self {
-        let parts = parts.clamp(1, PER_LEVEL);
-        let at = |v: usize| response.log_light((v as f64 / parts as f64).min(255.0) / 255.0) as f32;
-        let mut light: Vec<f32> = (0..=255 * parts + 1).map(at).collect();
-        // Below a quarter of a level light falls in proportion; black stays black whatever the gain.
+        let parts = parts.clamp(1, ENTRIES_PER_LEVEL);
+        let at = |v: usize| response.log_radiance((v as f64 / parts as f64).min(255.0) / 255.0) as f32;
+        let mut log_radiance: Vec<f32> = (0..=255 * parts + 1).map(at).collect();
+        // Below a quarter of a level the response is linear; black stays black for any gain.
         for v in 1..parts.div_ceil(4) {
-            light[v] = light[parts.div_ceil(4)] + (v as f32 / parts.div_ceil(4) as f32).log2();
+            log_radiance[v] = log_radiance[parts.div_ceil(4)] + (v as f32 / parts.div_ceil(4) as f32).log2();
         }
-        light[0] = LEAST;
+        log_radiance[0] = MIN_LOG_RADIANCE;
         let per_stop = 255.0 / response.slope(1.0);
         let white = 255.0 + per_stop * highest.max(0.0);
         let a = (white - KNEE) / (255.0 - KNEE);
         let mut below = 0;
         let mut levels = Box::new([255.0; 1024]);
         for (i, entry) in levels.iter_mut().enumerate() {
-            let stops = f64::from(LEAST + i as f32 / PER_STOP);
-            // The inverse of the response, whose entries rise.
-            while below < 255 * parts - 1 && f64::from(light[below + 1]) < stops {
+            let stops = f64::from(MIN_LOG_RADIANCE + i as f32 / ENTRIES_PER_STOP);
+            // Inverse of the monotonic response.
+            while below < 255 * parts - 1 && f64::from(log_radiance[below + 1]) < stops {
                 below += 1;
             }
-            let (low, high) = (f64::from(light[below]), f64::from(light[below + 1]));
+            let (low, high) = (f64::from(log_radiance[below]), f64::from(log_radiance[below + 1]));
             let level = if stops >= 0.0 {
                 255.0 + per_stop * stops
             } else {
@@ -58,37 +58,37 @@ impl Tone {
             let level = if level <= KNEE { level } else { KNEE + (255.0 - KNEE) * a * t / (1.0 + (a - 1.0) * t) };
             *entry = level as f32;
         }
-        let place = |k: usize| {
-            let step = PER_LEVEL / parts;
+        let index_of = |k: usize| {
+            let step = ENTRIES_PER_LEVEL / parts;
             let (v, fraction) = ((k / step).min(255 * parts), (k % step) as f32 / step as f32);
-            (light[v] + fraction * (light[v + 1] - light[v]) - LEAST) * PER_STOP
+            (log_radiance[v] + fraction * (log_radiance[v + 1] - log_radiance[v]) - MIN_LOG_RADIANCE) * ENTRIES_PER_STOP
         };
-        Self { light: Box::new(std::array::from_fn(place)), levels }
+        Self { log_radiance: Box::new(std::array::from_fn(index_of)), levels }
     }
 
-    /// Where among `levels` the light of a level lies, which may be between two: that of the nearest entry, or, `FINE`, between two.
+    /// Returns the fractional index into `levels` for a level: that of the nearest table entry, or, if `FINE`, linearly interpolated.
     #[inline(always)]
-    fn light<const FINE: bool>(&self, level: f32) -> f32 {
+    fn index<const FINE: bool>(&self, level: f32) -> f32 {
         if FINE {
-            let (i, fraction) = split(level.clamp(0.0, 255.0) * PER_LEVEL as f32);
-            let (low, high) = (self.light[i & 2047], self.light[(i + 1) & 2047]);
+            let (i, fraction) = split(level.clamp(0.0, 255.0) * ENTRIES_PER_LEVEL as f32);
+            let (low, high) = (self.log_radiance[i & 2047], self.log_radiance[(i + 1) & 2047]);
             return low + fraction * (high - low);
         }
-        let (i, _) = split(level.clamp(0.0, 255.0) * PER_LEVEL as f32 + 0.5);
-        self.light[i & 2047]
+        let (i, _) = split(level.clamp(0.0, 255.0) * ENTRIES_PER_LEVEL as f32 + 0.5);
+        self.log_radiance[i & 2047]
     }
 
-    /// The level of the panorama at a place among `levels`.
+    /// Returns the level of the panorama at a fractional index into `levels`.
     #[inline(always)]
-    fn level(&self, place: f32) -> f32 {
-        let (i, fraction) = split(place.clamp(0.0, 1022.0));
+    fn level(&self, index: f32) -> f32 {
+        let (i, fraction) = split(index.clamp(0.0, 1022.0));
         let (low, high) = (self.levels[i & 1023], self.levels[(i + 1) & 1023]);
         low + fraction * (high - low)
     }
 }
 
-/// An integer and a fraction of 0 to 1 that make up a number of 0 to some thousands; an integer may be split as one less and 1. Without a conversion, which
-/// has to ask about what is no number: at 1.5 · 2²³ a float's last bits are its integer part.
+/// Splits a number of 0 to some thousands into an integer and a fraction of 0 to 1 (an integer may give itself less one, and 1). Avoids the saturating
+/// conversion: at 1.5 · 2²³ the last bits of a float are its integer part.
 #[inline(always)]
 fn split(v: f32) -> (usize, f32) {
     const SHIFT: f32 = 12_582_912.0;
@@ -96,45 +96,45 @@ fn split(v: f32) -> (usize, f32) {
     (shifted.to_bits() as usize & 0xffff, v - (shifted - SHIFT))
 }
 
-/// What is done to the light of a photograph.
+/// Exposure correction of one photograph.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ExposureCorrection<'a> {
     pub(crate) tone: &'a Tone,
-    /// Stops by which red, green and blue are lifted.
+    /// Gains of red, green and blue in stops.
     pub(crate) gain: [f32; 3],
-    /// `v₁` and `v₂`: `v₁ r² + v₂ r⁴` more stops at a distance r from the middle, 1 at the corners.
+    /// Vignetting correction `v₁ r² + v₂ r⁴` in stops, r the distance from the image center, 1 at the corners.
     pub(crate) vignetting: [f32; 2],
-    /// Light from which on a photograph counts as clipped; white is 1. For linear light only.
+    /// Radiance above which a sample is clipped; white is 1. For linear radiance only.
     pub(crate) clipped: f32,
 }
 
 impl<'a> ExposureCorrection<'a> {
-    /// That of one photograph.
+    /// Returns the correction of one photograph.
     pub(crate) fn new(tone: &'a Tone, gains: &Gains, photo: usize) -> Self {
         let gain = gains.gains.get(photo).map_or([0.0; 3], |g| g.map(f32::log2));
         let clipped = gains.clipped();
         Self { tone, gain, clipped, vignetting: gains.vignetting.map(|v| v * std::f32::consts::LOG2_E) }
     }
 
-    /// Stops more at the square of a distance from the middle.
+    /// Returns the vignetting correction, in stops, at a squared distance from the image center.
     #[inline(always)]
-    pub(crate) fn lift(&self, r2: f32) -> f32 {
+    pub(crate) fn vignetting_stops(&self, r2: f32) -> f32 {
         r2 * (self.vignetting[0] + r2 * self.vignetting[1])
     }
 
-    /// The levels of the panorama for a color of the photograph that is lifted by as many stops more.
+    /// Maps a color of the photograph to levels of the panorama; `lift` is an additional gain in stops.
     ///
-    /// A color whose channels were all clipped is a bound, not a measurement: it stays white whatever its gain.
+    /// A color clipped in all channels is a lower bound, not a measurement: it stays white for any gain.
     pub(crate) fn levels(&self, color: [f32; 3], lift: f32) -> [f32; 3] {
         let [mut r, mut g, mut b] = color.map(|v| [v]);
         self.row_of_levels::<false>([&mut r, &mut g, &mut b], &[lift], &mut [0.0]);
         [r[0], g[0], b[0]]
     }
 
-    /// As [`Self::levels`], for rows of red, green and blue and of stops that are as long. `clipped` is a buffer as long. `FINE`: for more than bytes.
+    /// As [`Self::levels`], for rows of red, green, blue and additional stops of equal length; `clipped` is a scratch buffer. `FINE`: for 16 bits.
     #[inline(always)]
     pub(crate) fn row_of_levels<const FINE: bool>(&self, colors: [&mut [f32]; 3], lifts: &[f32], clipped: &mut [f32]) {
-        /// Smallest channel from which on a color counts as clipped, more and more up to the second.
+        /// Smallest channel at which a color begins to count as clipped, and at which it counts fully.
         const CLIPPED: [f32; 2] = [228.0, 252.0];
         let n = lifts.len();
         let ([r, g, b], clipped) = (colors.map(|c| &mut c[..n]), &mut clipped[..n]);
@@ -142,10 +142,10 @@ impl<'a> ExposureCorrection<'a> {
             let share = ((r.min(*g).min(*b) - CLIPPED[0]) * (1.0 / (CLIPPED[1] - CLIPPED[0]))).clamp(0.0, 1.0);
             *clipped = share * share * (3.0 - 2.0 * share);
         }
-        // A channel at a time: pixels do not wait for each other.
+        // One channel at a time, so that lookups of different pixels overlap.
         for (values, gain) in [r, g, b].into_iter().zip(self.gain) {
             for ((value, lift), clipped) in values.iter_mut().zip(lifts).zip(&*clipped) {
-                let tone = self.tone.level(self.tone.light::<FINE>(*value) + (gain + lift) * PER_STOP);
+                let tone = self.tone.level(self.tone.index::<FINE>(*value) + (gain + lift) * ENTRIES_PER_STOP);
                 *value = tone + clipped * (255.0 - tone);
             }
         }
@@ -197,7 +197,7 @@ mod tests {
 
     #[test]
     fn fine_curves_follow_the_standard_to_a_hundredth_of_a_level() {
-        let tone = Tone::new(&Response::default(), 0.0, PER_LEVEL);
+        let tone = Tone::new(&Response::default(), 0.0, ENTRIES_PER_LEVEL);
         for stops in [-1.0, -0.3, 0.0, 0.4, 1.5_f32] {
             let correction = correction(&tone, stops);
             for k in 1..2200 {

@@ -1,13 +1,13 @@
-//! Photographs of 8 and of 16 bits: one way from photograph to panorama for both.
+//! Sample types of photographs: 8 and 16 bits.
 //!
-//! What is drawn is as deep as the photographs. Where they belong, how their light differs and where seams run is decided on 8 bits. The methods here stand in for a generic function that a
-//! caller's crate would compile, with that crate's optimization: they are compiled in this one, once for each depth.
+//! The panorama has the bit depth of the photographs; alignment, exposure and seams are estimated on 8 bits. The methods dispatch generic code so that it is
+//! compiled, and optimized, in this crate instead of the caller's, once per depth.
 
 use crate::align::Alignment;
 use crate::blend::{BlendMode, Blender, of_mode};
 use crate::render::{CompositingOptions, Panorama, RenderError, draw};
 use crate::rows::for_each_row;
-use crate::surface::{WarpedPhoto, box_shrunk};
+use crate::surface::{WarpedPhoto, downsample_box};
 use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Stage};
 use cv_imgproc::{Pixel, bicubic_at, bicubic_rgb_at, resize_area};
 use fearless_simd::Simd;
@@ -15,9 +15,9 @@ use rayon::prelude::*;
 use std::borrow::Cow;
 use std::ops::{Add, Mul};
 
-/// What the pixels of photographs and panoramas are made of: `u8`, or `u16` with 65535 for white. Both are encoded as sRGB is, not linear.
+/// Sample type of photographs and panoramas: `u8`, or `u16` with 65535 for white; sRGB-encoded, not linear.
 pub trait PhotoSample: Internals {
-    /// White; as opacity, that nothing shows through.
+    /// Maximum value: white, or fully opaque.
     const WHITE: Self;
 }
 
@@ -29,17 +29,17 @@ impl PhotoSample for u16 {
     const WHITE: Self = 65535;
 }
 
-/// What photographs are drawn and blended in: a [`PhotoSample`], or linear light in `f32`.
+/// Sample type of warped photographs: a [`PhotoSample`], or linear radiance in `f32`.
 pub trait Channel: Pixel {
-    /// Opacity where a photograph reaches.
+    /// Opacity where a photograph covers a pixel.
     const OPAQUE: Self;
-    /// Units of a gray level of 8 bits.
+    /// Sample units per gray level of 8 bits.
     const PER_LEVEL: f32;
-    /// Parts of such a level that the curves of light tell apart.
+    /// Quantization steps per gray level of the tone tables.
     const PARTS: usize;
-    /// Whether it is light, not levels.
+    /// Whether samples are linear radiance.
     const LINEAR: bool = false;
-    /// Holds 256 samples.
+    /// Integer type of sums of up to 256 samples.
     type Sum: Sum;
 
     fn widened(self) -> Self::Sum;
@@ -48,18 +48,18 @@ pub trait Channel: Pixel {
     fn bicubic<S: Simd>(simd: S, view: ImageView<'_, Self, 3>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3];
 }
 
-/// What the stages need to know of a [`PhotoSample`].
+/// Internal operations of a [`PhotoSample`].
 pub trait Internals: Channel {
-    /// The sample as an index.
+    /// Converts the sample to an index.
     fn index(self) -> usize;
 
-    /// Means of `step × step` pixels, 2 and more.
+    /// Averages blocks of `step × step` pixels, 2 or more.
     fn shrunk(photo: ImageView<'_, Self, 3>, step: usize, stage: &Stage<'_>) -> Result<Image<Self, 3>, Cancelled>;
 
-    /// A copy in 8 bits; `None` where it is of 8 bits itself.
+    /// Converts to 8 bits; `None` where it has 8 bits already.
     fn in_8_bits(photo: ImageView<'_, Self, 3>, stage: &Stage<'_>) -> Result<Option<RgbU8>, Cancelled>;
 
-    /// Drawn photographs in 8 bits.
+    /// Converts warped photographs to 8 bits.
     fn drawn_in_8_bits<'a>(
         photos: &'a [Option<WarpedPhoto<Self>>],
         stage: &Stage<'_>,
@@ -130,7 +130,7 @@ impl Internals for u8 {
     }
 
     fn shrunk(photo: ImageView<'_, Self, 3>, step: usize, stage: &Stage<'_>) -> Result<Image<Self, 3>, Cancelled> {
-        box_shrunk(photo, step, stage)
+        downsample_box(photo, step, stage)
     }
 
     fn in_8_bits(_: ImageView<'_, Self, 3>, _: &Stage<'_>) -> Result<Option<RgbU8>, Cancelled> {
@@ -204,7 +204,7 @@ impl Internals for u16 {
     fn shrunk(photo: ImageView<'_, Self, 3>, step: usize, stage: &Stage<'_>) -> Result<Image<Self, 3>, Cancelled> {
         stage.check()?;
         let (width, height) = ((photo.width() / step).max(1), (photo.height() / step).max(1));
-        // Blocks that are not whole are left out, as of bytes.
+        // Incomplete blocks are dropped, as for bytes.
         let whole = photo.crop(0, 0, (width * step).min(photo.width()), (height * step).min(photo.height()));
         let small = whole.and_then(|whole| resize_area(whole, width, height).ok());
         Ok(small.unwrap_or_else(|| photo.to_image()))
@@ -247,14 +247,14 @@ impl Internals for u16 {
     }
 }
 
-/// To the nearest of 8 bits.
+/// Rounds to the nearest of 8 bits.
 fn to_bytes(deep: &[u16], bytes: &mut [u8]) {
     for (byte, deep) in bytes.iter_mut().zip(deep) {
         *byte = ((u32::from(*deep) + 128) / 257) as u8;
     }
 }
 
-/// Photographs in 8 bits: themselves, or copies of deeper ones.
+/// 8-bit views of photographs: borrowed, or of converted copies.
 #[derive(Debug)]
 pub struct EightBits<'a> {
     views: Vec<ImageView<'a, u8, 3>>,
@@ -262,7 +262,7 @@ pub struct EightBits<'a> {
 }
 
 impl<'a> EightBits<'a> {
-    /// Those of photographs of any depth, rounded to the nearest level. O(samples) where they are deeper, and then reported as `stage`, a unit for each photograph.
+    /// Converts photographs of any depth, rounding to the nearest level. O(samples) for 16 bits, reported as `stage`, a unit per photograph.
     ///
     /// # Errors
     /// [`Cancelled`] where `progress` says so.
@@ -284,7 +284,7 @@ impl<'a> EightBits<'a> {
         Ok(Self { views: Vec::new(), copies: copies.into_iter().flatten().collect() })
     }
 
-    /// In the order of the photographs.
+    /// Returns the views in the order of the photographs.
     pub fn views(&self) -> Vec<ImageView<'_, u8, 3>> {
         self.views.iter().copied().chain(self.copies.iter().map(RgbU8::view)).collect()
     }

@@ -1,35 +1,35 @@
-//! Exposure, white balance, response curve and vignetting from what photographs have in common (after Goldman & Chen 2005, "Vignette and exposure calibration and
+//! Exposure, white balance, camera response and vignetting from the overlaps (after Goldman & Chen 2005, "Vignette and exposure calibration and
 //! compensation", and Brown & Lowe 2007, §6).
 //!
-//! Where photographs overlap they saw the same light: `L(I_a) + g_a + v(r_a) = L(I_b) + g_b + v(r_b)`, with `L` the logarithm of light by the response that all share,
-//! a gain `g` per photograph and channel, and one vignetting toward the corners, `v(r) = v₁ r² + v₂ r⁴`. That is linear in all unknowns: one least squares
-//! problem, reweighted so that what moved or does not fit counts little. A level that is clipped is a bound: an equation only where the other photograph violates it.
+//! Overlapping photographs recorded the same radiance: `L(I_a) + g_a + v(r_a) = L(I_b) + g_b + v(r_b)`, with `L` the log radiance by the common response,
+//! a log gain `g` per photograph and channel, and common vignetting `v(r) = v₁ r² + v₂ r⁴`. This is linear in all unknowns and solved by iteratively reweighted
+//! least squares (Cauchy weights). A clipped level is a lower bound: an equation only where the other photograph violates it.
 
-use crate::light::{ExposureCorrection, Response, Tone, response::COEFFICIENTS};
+use crate::photometric::{ExposureCorrection, Response, Tone, response::COEFFICIENT_COUNT};
 use crate::surface::{Piece, Preview};
 use cv_core::{Cancelled, Progress, Stage, named};
 use nalgebra::{DMatrix, DVector};
 
-/// How exposure differences are evened out.
+/// Exposure compensation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Exposure {
-    /// Not at all.
+    /// None.
     None,
-    /// Exposure and white balance of each photograph, in light, with the response curve and the vignetting of the camera.
+    /// Exposure and white balance of each photograph in linear radiance, with the response and the vignetting of the camera.
     #[default]
     Match,
 }
 
 named!(Exposure { None = "none", Match = "match" | "gain" | "vignetting" });
 
-/// What makes the light of photographs one.
+/// Photometric parameters of all photographs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Gains {
-    /// Factors on the red, green and blue light of each photograph.
+    /// Factors on the linear red, green and blue of each photograph.
     pub gains: Vec<[f32; 3]>,
-    /// `v₁` and `v₂`: the light at distance r from the middle (1 at the corners) is multiplied by `exp(v₁ r² + v₂ r⁴)`.
+    /// `v₁` and `v₂`: radiance at distance r from the image center (1 at the corners) is multiplied by `exp(v₁ r² + v₂ r⁴)`.
     pub vignetting: [f32; 2],
-    /// The light of a level `v`, 0 to 1, is that of sRGB times `2^((1 − v)(p₀ + p₁ v + p₂ v²))`.
+    /// `p₀`, `p₁`, `p₂`: the radiance of a level `v`, 0 to 1, is that of sRGB times `2^((1 − v)(p₀ + p₁ v + p₂ v²))`.
     pub response: [f64; 3],
 }
 
@@ -38,65 +38,67 @@ impl Gains {
         Self { gains: vec![[1.0; 3]; photos], vignetting: [0.0; 2], response: [0.0; 3] }
     }
 
-    /// Stops above white that a photograph's own white comes to, 0 or more.
-    fn highest(&self) -> f64 {
+    /// Returns the maximum gain in stops, 0 or more: the headroom above white.
+    fn headroom_stops(&self) -> f64 {
         f64::from(self.gains.iter().flatten().copied().fold(1.0, f32::max).log2())
     }
 
-    /// Light of the level from which on a photograph counts as clipped.
+    /// Returns the radiance above which a sample is clipped.
     pub(crate) fn clipped(&self) -> f32 {
-        self.light(f64::from(CLIPPED) / 255.0)
+        self.radiance(f64::from(CLIPPED) / 255.0)
     }
 
-    /// Light of a level of 0 to 1; 1 for white.
-    pub(crate) fn light(&self, level: f64) -> f32 {
-        // Below a quarter of a level, where the response ends, light falls in proportion.
+    /// Returns the radiance of a level of 0 to 1; 1 for white.
+    pub(crate) fn radiance(&self, level: f64) -> f32 {
+        // Linear below a quarter of a level.
         let held = level.max(0.25 / 255.0);
-        (Response { coefficients: self.response }.log_light(held).exp2() * level / held) as f32
+        (Response { coefficients: self.response }.log_radiance(held).exp2() * level / held) as f32
     }
 
-    /// The curves from levels to levels, for photographs that tell so many parts of a level apart.
+    /// Builds the tone tables for photographs of `parts` quantization steps per gray level.
     pub(crate) fn tone(&self, parts: usize) -> Tone {
-        Tone::new(&Response { coefficients: self.response }, self.highest(), parts)
+        Tone::new(&Response { coefficients: self.response }, self.headroom_stops(), parts)
     }
 }
 
-/// Two photographs' readings of one place.
+/// The levels of two photographs at one canvas position.
 #[derive(Debug, Clone, Copy)]
 struct Sample {
     a: usize,
     b: usize,
     /// Levels.
     levels: [[u8; 3]; 2],
-    /// r² of both.
+    /// Squared distances r² from the image centers.
     radius: [f64; 2],
-    /// Standard deviation of the difference of the levels beside noise: the slope of the picture there, over which the photographs may be out of place.
+    /// Local gradient in gray levels per preview pixel: scales the uncertainty due to misalignment.
     slope: f64,
 }
 
-/// Samples taken from each overlap at most.
-const PER_OVERLAP: usize = 2000;
-/// The least level that counts as clipped; compression lets them vary.
+/// Maximum number of samples per overlap.
+const MAX_SAMPLES: usize = 2000;
+/// Minimum level that counts as clipped; JPEG compression varies clipped levels.
 const CLIPPED: u8 = 250;
-/// The darkest level that is read: below, noise and the black point decide.
-const DARK: u8 = 5;
-/// A level from which on a photograph shows hardly anything, and another is preferred.
-pub(crate) const UNREADABLE: u8 = CLIPPED;
-/// Standard deviation of a level of a preview: rounding, compression, what is left of noise.
-const NOISE: f64 = 0.8;
-/// Share of the difference of neighboring levels by which photographs may differ because they are out of place by part of a preview pixel.
-const OUT_OF_PLACE: f64 = 0.25;
-/// Standard deviations from which on a sample counts less.
-const OUTLIER: f64 = 2.5;
-/// Standard deviations, beforehand, of stops at the corners, and of the coefficients of a response. Both count as much as [`BELIEF`] of all samples.
-const VIGNETTING: f64 = 0.5;
-const CURVE: f64 = 1.0;
-const BELIEF: f64 = 2e-3;
+/// Minimum level that is used: noise and the black point dominate below.
+const MIN_LEVEL: u8 = 5;
+/// Level above which another photograph is preferred.
+pub(crate) const SATURATED_LEVEL: u8 = CLIPPED;
+/// Standard deviation of a preview level, in gray levels: rounding, compression, residual noise.
+const NOISE_SIGMA: f64 = 0.8;
+/// Standard deviation of the misalignment in preview pixels.
+const MISALIGNMENT_SIGMA_PX: f64 = 0.25;
+/// Scale of the Cauchy weight in standard deviations.
+const CAUCHY_SCALE: f64 = 2.5;
+/// Prior standard deviation of the vignetting coefficients, in stops.
+const VIGNETTING_SIGMA: f64 = 0.5;
+/// Prior standard deviation of the response coefficients.
+const RESPONSE_SIGMA: f64 = 1.0;
+/// Weight of these priors relative to the sum of the weights of all samples.
+const PRIOR_WEIGHT: f64 = 2e-3;
 
-/// Terms of a sample: unknowns and their factors.
-type Terms = [(usize, f64); 4 + COEFFICIENTS];
+/// Sparse row of the design matrix: indices of unknowns and their coefficients.
+type Terms = [(usize, f64); 4 + COEFFICIENT_COUNT];
 
-/// Which unknowns there are.
+/// Which unknowns are estimated.
 #[derive(Clone, Copy)]
 struct Unknowns {
     photos: usize,
@@ -105,9 +107,9 @@ struct Unknowns {
 }
 
 impl Unknowns {
-    /// Those of gains, three to a photograph, of the vignetting and of the response, in this order.
+    /// Returns the number of unknowns: three gains per photograph, vignetting, response, in this order.
     fn count(&self) -> usize {
-        3 * self.photos + 2 + COEFFICIENTS
+        3 * self.photos + 2 + COEFFICIENT_COUNT
     }
 
     fn terms(&self, s: &Sample, c: usize) -> Terms {
@@ -126,7 +128,7 @@ impl Unknowns {
     }
 }
 
-/// Gains, vignetting and response from the overlaps on the preview.
+/// Estimates gains, vignetting and response from the overlaps of the preview.
 pub(crate) fn estimate_gains(
     preview: &Preview,
     photo_of: &[usize],
@@ -144,13 +146,13 @@ pub(crate) fn estimate_gains(
     if samples.is_empty() {
         return Ok(gains);
     }
-    // What says otherwise is no lens and no camera: without it, then.
+    // An implausible vignetting or response is dropped and the rest estimated again.
     let mut unknowns = Unknowns { photos, vignetting: true, curve: true };
     let solution = loop {
         let solution = solve(&samples, unknowns, &stage)?;
         let n = 3 * photos;
-        let (lens, curve) = (solution.rows(n, 2), solution.rows(n + 2, COEFFICIENTS));
-        // Corners are darkened, by no more than two stops.
+        let (lens, curve) = (solution.rows(n, 2), solution.rows(n + 2, COEFFICIENT_COUNT));
+        // Vignetting darkens the corners, monotonically and by at most two stops.
         let falls = |r2: f64| r2 * (lens[0] + r2 * lens[1]);
         let is_lens = falls(0.5) >= -0.02 && falls(1.0) >= falls(0.5) - 0.02 && falls(1.0) < 2.0;
         let is_curve = Response { coefficients: std::array::from_fn(|k| curve[k]) }.is_plausible();
@@ -172,14 +174,14 @@ pub(crate) fn estimate_gains(
     Ok(gains)
 }
 
-/// Places of the preview looked at for the mean.
-const FOR_MEAN: usize = 10_000;
+/// Maximum number of preview pixels sampled for the mean level.
+const MAX_MEAN_SAMPLES: usize = 10_000;
 
-/// Shifts the exposure of all so that the mean level of the panorama stays what the photographs have there, as far as one of them has such a mean: each place counts once, with the mean of
-/// those that show it. (Where the dark parts of a scene are seen by several photographs and the bright ones by one, that is more than any photograph has.)
+/// Chooses the common exposure, which the overlaps leave free: the mean level of the panorama is kept at that of the photographs, clamped to the range of their means. Each canvas
+/// position counts once, with the mean of the photographs that cover it. (Where several photographs cover the dark parts of a scene and one the bright parts, that exceeds the mean of every photograph.)
 fn anchor(gains: &mut Gains, preview: &Preview, photo_of: &[usize]) {
     let (width, height) = (preview.width, preview.height);
-    let step = (width * height).div_ceil(FOR_MEAN).max(1);
+    let step = (width * height).div_ceil(MAX_MEAN_SAMPLES).max(1);
     let mut colors = Vec::new();
     let (mut places, mut of_photo) = (0.0, vec![(0.0, 0.0); gains.gains.len()]);
     for (x, y) in (0..width * height).step_by(step).map(|i| (i % width, i / width)) {
@@ -217,7 +219,7 @@ fn anchor(gains: &mut Gains, preview: &Preview, photo_of: &[usize]) {
             .iter()
             .map(|(color, r2, photo, share)| {
                 let correction = &corrections[*photo];
-                let levels = correction.levels(*color, correction.lift(*r2));
+                let levels = correction.levels(*color, correction.vignetting_stops(*r2));
                 share * f64::from(levels[0] + levels[1] + levels[2])
             })
             .sum();
@@ -235,7 +237,7 @@ fn samples(preview: &Preview, photo_of: &[usize], stage: &Stage<'_>) -> Result<V
             if photo_of[i] == photo_of[j] {
                 continue;
             }
-            let step = ((common.width() * common.height()) as f64 / PER_OVERLAP as f64).sqrt().ceil().max(1.0) as usize;
+            let step = ((common.width() * common.height()) as f64 / MAX_SAMPLES as f64).sqrt().ceil().max(1.0) as usize;
             for y in (common.top..common.bottom).step_by(step) {
                 for x in (common.left..common.right).step_by(step) {
                     let (Some(a), Some(b)) = (p.warped.color(x, y), q.warped.color(x, y)) else { continue };
@@ -243,7 +245,7 @@ fn samples(preview: &Preview, photo_of: &[usize], stage: &Stage<'_>) -> Result<V
                         let b = piece.warped.bounds;
                         f64::from(piece.radius[(y - b.top) * b.width() + x - b.left])
                     };
-                    let (Some(s), Some(t)) = (steepest(p, x, y, a), steepest(q, x, y, b)) else { continue };
+                    let (Some(s), Some(t)) = (max_gradient(p, x, y, a), max_gradient(q, x, y, b)) else { continue };
                     let (a_of, b_of) = (photo_of[i], photo_of[j]);
                     let slope = f64::from(s.max(t));
                     samples.push(Sample { a: a_of, b: b_of, levels: [a, b], radius: [r2(p), r2(q)], slope });
@@ -254,8 +256,8 @@ fn samples(preview: &Preview, photo_of: &[usize], stage: &Stage<'_>) -> Result<V
     Ok(samples)
 }
 
-/// The greatest difference of a pixel, in any channel, to one of its four neighbors; `None` at the border.
-fn steepest(piece: &Piece, x: usize, y: usize, color: [u8; 3]) -> Option<u8> {
+/// Returns the maximum absolute difference, over channels, to the four neighbors; `None` at the border.
+fn max_gradient(piece: &Piece, x: usize, y: usize, color: [u8; 3]) -> Option<u8> {
     let around = [(x.checked_sub(1)?, y), (x + 1, y), (x, y.checked_sub(1)?), (x, y + 1)];
     around.into_iter().try_fold(0, |most, (x, y)| {
         let other = piece.warped.color(x, y)?;
@@ -263,7 +265,7 @@ fn steepest(piece: &Piece, x: usize, y: usize, color: [u8; 3]) -> Option<u8> {
     })
 }
 
-/// All unknowns by iteratively reweighted least squares, in stops.
+/// Solves for all unknowns, in stops, by iteratively reweighted least squares.
 fn solve(samples: &[Sample], unknowns: Unknowns, stage: &Stage<'_>) -> Result<DVector<f64>, Cancelled> {
     let n = unknowns.count();
     let gains = 3 * unknowns.photos;
@@ -274,8 +276,8 @@ fn solve(samples: &[Sample], unknowns: Unknowns, stage: &Stage<'_>) -> Result<DV
         let slopes: Vec<f64> = (0..=255).map(|v| curve.slope(f64::from(v) / 255.0) / 255.0).collect();
         let mut normal = DMatrix::<f64>::zeros(n, n);
         let mut right = DVector::<f64>::zeros(n);
-        // The first rounds are wide: exposures may differ by stops.
-        let scale = (256.0 / f64::from(1 << round.min(8))).max(OUTLIER);
+        // The Cauchy scale shrinks from a wide initial value: exposures may differ by stops.
+        let scale = (256.0 / f64::from(1 << round.min(8))).max(CAUCHY_SCALE);
         let mut total = 0.0;
         for (i, s) in samples.iter().enumerate() {
             if i % 4096 == 0 {
@@ -283,17 +285,17 @@ fn solve(samples: &[Sample], unknowns: Unknowns, stage: &Stage<'_>) -> Result<DV
             }
             for c in 0..3 {
                 let [a, b] = s.levels.map(|l| l[c]);
-                if a.min(b) < DARK || a.min(b) >= CLIPPED {
+                if a.min(b) < MIN_LEVEL || a.min(b) >= CLIPPED {
                     continue;
                 }
                 let terms = unknowns.terms(s, c);
                 let d = srgb[usize::from(a)] - srgb[usize::from(b)];
                 let residual = d + terms.iter().map(|&(k, t)| t * solution[k]).sum::<f64>();
-                // A clipped level stands for its light or more.
+                // A clipped level is a lower bound of the radiance.
                 if a >= CLIPPED && residual <= 0.0 || b >= CLIPPED && residual >= 0.0 {
                     continue;
                 }
-                let level = NOISE.hypot(OUT_OF_PLACE * s.slope);
+                let level = NOISE_SIGMA.hypot(MISALIGNMENT_SIGMA_PX * s.slope);
                 let sigma = level * slopes[usize::from(a)].hypot(slopes[usize::from(b)]);
                 let weight = 1.0 / (sigma * sigma * (1.0 + (residual / (scale * sigma)).powi(2)));
                 total += weight;
@@ -305,13 +307,13 @@ fn solve(samples: &[Sample], unknowns: Unknowns, stage: &Stage<'_>) -> Result<DV
                 }
             }
         }
-        // Enough to settle the common factor, nothing else.
+        // Fixes the gauge (the common factor) only.
         for k in 0..gains {
             normal[(k, k)] += 1e-6 * total.max(1.0);
         }
         for k in gains..n {
-            let sigma = if k < gains + 2 { VIGNETTING } else { CURVE };
-            normal[(k, k)] += BELIEF * total.max(1.0) / (sigma * sigma);
+            let sigma = if k < gains + 2 { VIGNETTING_SIGMA } else { RESPONSE_SIGMA };
+            normal[(k, k)] += PRIOR_WEIGHT * total.max(1.0) / (sigma * sigma);
         }
         let Some(factor) = normal.cholesky() else { break };
         solution = factor.solve(&right);

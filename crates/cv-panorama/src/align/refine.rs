@@ -1,0 +1,404 @@
+//! Sub-pixel refinement of matches by least-squares matching (Gruen 1985, "Adaptive least squares correlation"), and of the alignment with them.
+//!
+//! Feature positions have errors of some tenths of a pixel, from the scale space they are detected in. Around each inlier a patch of one photograph is registered to the
+//! other, with a gain and an offset for exposure differences, which is accurate to some hundredths; the bundle adjustment is then repeated.
+
+use crate::align::{AlignError, AlignOptions, Alignment, Photo, View, align};
+use cv_core::{Cancelled, Correspondence, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
+use cv_geometry::VerifiedPair;
+use cv_imgproc::bicubic_at;
+use fearless_simd::{Level, dispatch};
+use nalgebra::{SMatrix, SVector};
+use rayon::prelude::*;
+
+/// Patch radius in pixels.
+const RADIUS: usize = 9;
+/// Side of a patch.
+const SIDE: usize = 2 * RADIUS + 1;
+/// Side of a patch with a margin of one pixel for gradients.
+const WIDE: usize = SIDE + 2;
+/// Maximum number of patches per pair, and per photograph if it has several pairs.
+const MAX_PATCHES: usize = 300;
+/// Scale of the loss relative to that of features, without parallax.
+const NARROW_LOSS_RATIO: f64 = 0.25;
+/// Median error of the features, relative to the scale of the loss, above which there is parallax: features alone are good to a quarter.
+const MAX_MEDIAN_RATIO: f64 = 0.4;
+/// Minimum number of refined matches of a pair; below, its features are kept.
+const MIN_MATCHES: usize = 20;
+/// Maximum number of Gauss-Newton iterations.
+const MAX_ITERATIONS: usize = 8;
+/// Convergence tolerance in pixels.
+const TOLERANCE_PX: f64 = 0.01;
+/// Maximum correction of a match in pixels.
+const MAX_CORRECTION_PX: f64 = 2.0;
+/// Minimum correlation of the registered patches.
+const MIN_CORRELATION: f64 = 0.7;
+/// Maximum standard error of a registered position along either axis, in pixels, estimated from the residuals of the patch.
+const MAX_STANDARD_ERROR_PX: f64 = 0.1;
+/// Minimum smaller eigenvalue of the structure tensor of a patch: with noise of a gray level the standard error is the maximum.
+const MIN_CORNER_STRENGTH: f64 = 1.0;
+/// Level from which on a pixel is clipped.
+const CLIPPED: u8 = 250;
+
+/// Refines an alignment of `images`, of the sizes of `photos`, by the pixels around the matches of its pairs. O(matches · patch).
+///
+/// The matches of the result are those of `alignment`, with their errors by the refined views. Where the refined matches do not register the same photographs, `alignment` is returned.
+///
+/// # Errors
+/// [`Cancelled`].
+pub fn refine_alignment(
+    images: &[GrayU8],
+    photos: &[Photo],
+    pairs: &[VerifiedPair],
+    alignment: Alignment,
+    options: &AlignOptions,
+    progress: &dyn Progress,
+) -> Result<Alignment, Cancelled> {
+    let stage = Stage::new(progress, "align", 0)?;
+    let used = alignment.used().count();
+    let count = (MAX_PATCHES * used / alignment.pairs.len().max(1)).min(MAX_PATCHES);
+    let refine = |pair: &VerifiedPair| -> Result<Option<VerifiedPair>, Cancelled> {
+        stage.check()?;
+        let view = |i: usize| alignment.views.get(i).and_then(|v| v.as_ref().ok());
+        let is_used = alignment.pairs.iter().any(|p| (p.a, p.b) == (pair.a, pair.b));
+        let (Some(from), Some(to), true) = (view(pair.a), view(pair.b), is_used) else { return Ok(None) };
+        let (Some(first), Some(second)) = (images.get(pair.a), images.get(pair.b)) else { return Ok(None) };
+        let candidates = candidates(pair, from, to, count);
+        let refined = candidates.iter().filter_map(|m| refine_match(first, second, from, to, m));
+        let matches: Vec<Correspondence> = refined.collect();
+        if matches.len() < MIN_MATCHES {
+            return Ok(Some(pair.clone()));
+        }
+        Ok(Some(VerifiedPair { inliers: (0..matches.len()).collect(), matches, ..pair.clone() }))
+    };
+    let refined: Vec<Option<VerifiedPair>> = pairs.par_iter().map(refine).collect::<Result<_, _>>()?;
+    let refined: Vec<VerifiedPair> = refined.into_iter().flatten().collect();
+    // Without parallax, residuals are those of the registration, and a narrow loss rejects what moved.
+    let has_parallax = alignment.median_px > MAX_MEDIAN_RATIO * options.outlier_px;
+    let outlier_px = options.outlier_px * if has_parallax { 1.0 } else { NARROW_LOSS_RATIO };
+    let options = AlignOptions { motion: alignment.motion, outlier_px, ..*options };
+    // The focal lengths found are where the search for better ones starts.
+    let focal = |i: usize| alignment.views.get(i).and_then(|v| v.as_ref().ok()).map(|v| v.camera.fx);
+    let photos: Vec<Photo> =
+        photos.iter().enumerate().map(|(i, p)| Photo { focal: focal(i).or(p.focal), ..*p }).collect();
+    let mut found = match align(&photos, &refined, &options, progress) {
+        Ok(found) => found,
+        Err(AlignError::Cancelled(stop)) => return Err(stop),
+        Err(_) => return Ok(alignment),
+    };
+    let same = found.views.iter().zip(&alignment.views).all(|(a, b)| a.is_ok() == b.is_ok());
+    if !same || found.pairs.len() != alignment.pairs.len() {
+        return Ok(alignment);
+    }
+    (found.reference, found.views) = (alignment.reference, keep_reasons(found.views, &alignment));
+    found.pairs = alignment.pairs;
+    found.measure();
+    Ok(found)
+}
+
+/// Positions where patches are registered: `count` at most, half of them at features, the others on a grid over the overlap.
+fn candidates(pair: &VerifiedPair, from: &View, to: &View, count: usize) -> Vec<Correspondence> {
+    let step = pair.matches.len().div_ceil(count / 2).max(1);
+    let mut candidates: Vec<Correspondence> = pair.matches.iter().copied().step_by(step).collect();
+    let transfer =
+        |a: Point2<f64>| Some(Correspondence { a, b: to.project(&from.ray(a)?).filter(|b| to.contains(*b))? });
+    let (width, height) = (from.camera.width as f64, from.camera.height as f64);
+    // The overlap's area on a coarse grid gives the spacing of the fine one.
+    let grid = |spacing: f64| {
+        let (across, down) = ((width / spacing) as usize, (height / spacing) as usize);
+        let place = move |i: usize| (i as f64 + 0.5) * spacing;
+        (0..down).flat_map(move |y| (0..across).map(move |x| Point2::new(place(x), place(y))))
+    };
+    let coarse = (width * height / 400.0).sqrt().max(1.0);
+    let covered = grid(coarse).filter(|a| transfer(*a).is_some()).count() as f64 * coarse * coarse;
+    let spacing = (covered / (count - candidates.len().min(count)).max(1) as f64).sqrt().max(SIDE as f64);
+    candidates.extend(grid(spacing).filter_map(transfer));
+    candidates
+}
+
+/// The new views, and the old reasons of photographs without one.
+fn keep_reasons(
+    views: Vec<Result<View, crate::Unplaced>>,
+    alignment: &Alignment,
+) -> Vec<Result<View, crate::Unplaced>> {
+    views.into_iter().zip(&alignment.views).map(|(new, old)| old.and(new)).collect()
+}
+
+/// Registers the patch around `m.a` to the second photograph; `None` where that fails: low texture, clipped pixels, low correlation, no convergence.
+fn refine_match(first: &GrayU8, second: &GrayU8, from: &View, to: &View, m: &Correspondence) -> Option<Correspondence> {
+    // At a pixel center, so that the template needs no interpolation.
+    let (x, y) = (m.a.x.round(), m.a.y.round());
+    let inside = |v: f64, n: usize| v >= RADIUS as f64 && v + RADIUS as f64 <= n as f64 - 1.0;
+    if !inside(x, first.width()) || !inside(y, first.height()) {
+        return None;
+    }
+    let a = Point2::new(x, y);
+    let transfer = |p: Point2<f64>| to.project(&from.ray(p)?);
+    let center = transfer(a)?;
+    let warp = Warp::new(|i, j| transfer(a + Vector2::new(i, j)), center)?;
+    let template = first.view().crop(x as usize - RADIUS, y as usize - RADIUS, SIDE, SIDE)?;
+    if (0..SIDE).any(|row| template.row(row).iter().any(|v| *v >= CLIPPED)) || !has_texture(template) {
+        return None;
+    }
+    let start = m.b + (center - transfer(m.a)?);
+    let mut b = start;
+    let mut patch = [0.0_f32; WIDE * WIDE];
+    for _ in 0..MAX_ITERATIONS {
+        if !sample(second, b, &warp, &mut patch) {
+            return None;
+        }
+        let step = gauss_newton_step(template, &patch)?;
+        b += warp.x * step.x + warp.y * step.y;
+        if (b - start).norm() > MAX_CORRECTION_PX {
+            return None;
+        }
+        if step.norm() < TOLERANCE_PX {
+            return Some(Correspondence { a, b });
+        }
+    }
+    None
+}
+
+/// Returns whether a template has gradients in both directions, before anything is sampled.
+fn has_texture(template: ImageView<'_, u8, 1>) -> bool {
+    let (mut xx, mut xy, mut yy) = (0, 0, 0);
+    for y in 1..SIDE - 1 {
+        let [above, row, below] = [y - 1, y, y + 1].map(|y| template.row(y));
+        for x in 1..SIDE - 1 {
+            let gx = i32::from(row[x + 1]) - i32::from(row[x - 1]);
+            let gy = i32::from(below[x]) - i32::from(above[x]);
+            (xx, xy, yy) = (xx + gx * gx, xy + gx * gy, yy + gy * gy);
+        }
+    }
+    // Twice the gradient each, in gray levels per pixel.
+    let [xx, xy, yy] = [xx, xy, yy].map(|v| f64::from(v) / (4 * (SIDE - 2) * (SIDE - 2)) as f64);
+    0.5 * (xx + yy) - (0.25 * (xx - yy).powi(2) + xy * xy).sqrt() >= MIN_CORNER_STRENGTH
+}
+
+/// Offsets in the second photograph by offsets in the first, to second order. The affine part alone would be off by some hundredths of a pixel at the border of the patch, all
+/// in one direction, which biases the focal length.
+struct Warp {
+    x: Vector2<f64>,
+    y: Vector2<f64>,
+    xx: Vector2<f64>,
+    yy: Vector2<f64>,
+    xy: Vector2<f64>,
+}
+
+impl Warp {
+    /// From central differences of `transfer` over the patch.
+    fn new(transfer: impl Fn(f64, f64) -> Option<Point2<f64>>, center: Point2<f64>) -> Option<Self> {
+        let r = RADIUS as f64;
+        let at = |i: f64, j: f64| Some(transfer(i * r, j * r)? - center);
+        let [left, right, above, below] = [at(-1.0, 0.0)?, at(1.0, 0.0)?, at(0.0, -1.0)?, at(0.0, 1.0)?];
+        let corners = at(1.0, 1.0)? + at(-1.0, -1.0)? - at(1.0, -1.0)? - at(-1.0, 1.0)?;
+        Some(Self {
+            x: (right - left) / (2.0 * r),
+            y: (below - above) / (2.0 * r),
+            xx: (right + left) / (2.0 * r * r),
+            yy: (below + above) / (2.0 * r * r),
+            xy: corners / (4.0 * r * r),
+        })
+    }
+
+    /// Offsets along a row of the patch, `base + i · linear + i² · square`.
+    fn row(&self, j: f64) -> [Vector2<f32>; 3] {
+        [self.y * j + self.yy * (j * j), self.x + self.xy * j, self.xx].map(|v| v.cast())
+    }
+
+    fn at(&self, i: f64, j: f64) -> Vector2<f64> {
+        self.x * i + self.y * j + self.xx * (i * i) + self.yy * (j * j) + self.xy * (i * j)
+    }
+}
+
+/// Samples the warped patch around `b` with a margin of one pixel; false where it leaves the image.
+fn sample(image: &GrayU8, b: Point2<f64>, warp: &Warp, patch: &mut [f32; WIDE * WIDE]) -> bool {
+    let h = (WIDE / 2) as f64;
+    let (right, bottom) = (image.width() as f64 - 2.0, image.height() as f64 - 2.0);
+    let is_inside = |p: Point2<f64>| p.x.is_finite() && p.x >= 1.0 && p.y >= 1.0 && p.x <= right && p.y <= bottom;
+    if ![(-h, -h), (h, -h), (-h, h), (h, h)].into_iter().all(|(i, j)| is_inside(b + warp.at(i, j))) {
+        return false;
+    }
+    let b = b.coords.cast::<f32>();
+    dispatch!(Level::new(), _simd => sample_rows(image, b, warp, patch));
+    true
+}
+
+#[inline(always)]
+fn sample_rows(image: &GrayU8, b: Vector2<f32>, warp: &Warp, patch: &mut [f32; WIDE * WIDE]) {
+    let (right, bottom) = ((image.width() - 1) as f32, (image.height() - 1) as f32);
+    let view = image.view();
+    let offset = (WIDE / 2) as f32;
+    for (j, row) in patch.chunks_exact_mut(WIDE).enumerate() {
+        let [base, linear, square] = warp.row(j as f64 - f64::from(offset));
+        for (i, value) in row.iter_mut().enumerate() {
+            let i = i as f32 - offset;
+            let p = b + base + linear * i + square * (i * i);
+            // Single-precision rounding stays within the image.
+            let (u, v) = (p.x.clamp(0.0, right), p.y.clamp(0.0, bottom));
+            let (x, y) = (u as usize, v as usize);
+            [*value] = bicubic_at(view, x, y, u - x as f32, v - y as f32);
+        }
+    }
+}
+
+/// Computes the displacement `d` of the template in the patch by linear least squares, `T = g (S + ∇S · d) + o(u)`, with an offset `o` that is linear over the patch (vignetting, and
+/// exposure differences); `None` for a low correlation, a large standard error, or clipped pixels.
+fn gauss_newton_step(template: ImageView<'_, u8, 1>, patch: &[f32; WIDE * WIDE]) -> Option<Vector2<f64>> {
+    let (mut normal, mut right) = (SMatrix::<f64, 6, 6>::zeros(), SVector::<f64, 6>::zeros());
+    let (mut sum, mut squares) = (0.0, 0.0);
+    for j in 0..SIDE {
+        for (i, t) in template.row(j).iter().enumerate() {
+            let k = (j + 1) * WIDE + i + 1;
+            let s = f64::from(patch[k]);
+            if s >= f64::from(CLIPPED) {
+                return None;
+            }
+            let gx = 0.5 * f64::from(patch[k + 1] - patch[k - 1]);
+            let gy = 0.5 * f64::from(patch[k + WIDE] - patch[k - WIDE]);
+            let place = |k: usize| k as f64 - RADIUS as f64;
+            let (row, t) = (SVector::from([gx, gy, s, 1.0, place(i), place(j)]), f64::from(*t));
+            normal += row * row.transpose();
+            right += row * t;
+            sum += t;
+            squares += t * t;
+        }
+    }
+    let n = (SIDE * SIDE) as f64;
+    let inverse = normal.cholesky()?.inverse();
+    let solution = inverse * right;
+    let gain = solution[2];
+    // The residual of a linear fit: squares less what it explains.
+    let (residual, variance) = (squares - solution.dot(&right), squares - sum * sum / n);
+    if !(0.1..10.0).contains(&gain) || residual > (1.0 - MIN_CORRELATION * MIN_CORRELATION) * variance {
+        return None;
+    }
+    let standard_error = (residual.max(0.0) / (n - 6.0) * inverse[(0, 0)].max(inverse[(1, 1)])).sqrt() / gain;
+    // (Not a number: not accepted.)
+    if !(standard_error < MAX_STANDARD_ERROR_PX) {
+        return None;
+    }
+    let step = Vector2::new(solution[0], solution[1]) / gain;
+    // The linearization holds for a pixel or so.
+    (step.norm() < MAX_CORRECTION_PX).then_some(step)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{StopAt, photograph, sky};
+    use crate::{CameraMotion, VerifyOptions, verify_pair};
+    use cv_core::{Camera, Matrix3, Silent, Vector3};
+    use nalgebra::Rotation3;
+
+    fn views() -> Vec<View> {
+        let turn = |yaw: f64, roll: f64| {
+            Rotation3::from_axis_angle(&Vector3::z_axis(), roll) * Rotation3::from_axis_angle(&Vector3::y_axis(), -yaw)
+        };
+        [(-0.45, 0.02), (0.0, -0.01), (0.4, 0.03)]
+            .map(|(yaw, roll)| View {
+                camera: Camera::from_focal(320, 240, 300.0),
+                from_world: turn(yaw, roll).into_inner(),
+            })
+            .to_vec()
+    }
+
+    /// Luma of what the views show; the second is exposed differently.
+    fn images(views: &[View]) -> Vec<GrayU8> {
+        let image = |(i, view): (usize, &View)| {
+            let gain = if i == 1 { 0.7 } else { 1.0 };
+            cv_imgproc::rgb_to_gray(photograph(view, |ray| sky(ray).map(|v| gain * v + 5.0)).view())
+        };
+        views.iter().enumerate().map(image).collect()
+    }
+
+    /// Matches of what two views both show, each off by up to `error` pixels in either direction.
+    fn matches(from: &View, to: &View, error: f64) -> Vec<Correspondence> {
+        let mut state = 5_u32;
+        let mut noise = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            error * (2.0 * f64::from(state >> 8) / f64::from(1 << 24) - 1.0)
+        };
+        let grid = (0..18)
+            .flat_map(|y| (0..24).map(move |x| Point2::new(12.0 + 12.7 * f64::from(x), 12.0 + 12.7 * f64::from(y))));
+        let mut shown = |a: Point2<f64>| {
+            let b = to.project(&from.ray(a)?).filter(|b| to.contains(*b))?;
+            Some(Correspondence { a: a + Vector2::new(noise(), noise()), b: b + Vector2::new(noise(), noise()) })
+        };
+        grid.filter_map(&mut shown).collect()
+    }
+
+    #[test]
+    fn registered_matches_have_the_accepted_standard_error_across_exposures_and_rotations() {
+        let views = views();
+        let images = images(&views);
+        for (i, j) in [(0, 1), (1, 0), (1, 2)] {
+            let (from, to) = (&views[i], &views[j]);
+            let mut off = Vec::new();
+            for m in matches(from, to, 0.7) {
+                if let Some(found) = refine_match(&images[i], &images[j], from, to, &m) {
+                    assert_eq!((found.a - m.a).map(|v| v.abs() <= 0.5), Vector2::new(true, true));
+                    off.push((found.b - to.project(&from.ray(found.a).unwrap()).unwrap()).norm());
+                }
+            }
+            off.sort_by(f64::total_cmp);
+            // Waves of 30 px are longer than the patch, so that displacement, gain and offset are nearly collinear: the errors are those of the accepted standard error along both axes
+            // (Rayleigh distribution: median 1.18 σ, 95 % 2.45 σ).
+            let sigma = MAX_STANDARD_ERROR_PX;
+            let (median, most) = (off[off.len() / 2], off[off.len() * 95 / 100]);
+            assert!(off.len() > 60 && median < 1.18 * sigma && most < 2.45 * sigma, "{} {median} {most}", off.len());
+        }
+    }
+
+    #[test]
+    fn low_texture_clipped_and_foreign_patches_are_rejected() {
+        let views = views();
+        let images = images(&views);
+        let m = matches(&views[0], &views[1], 0.0)[120];
+        let refine = |second: &GrayU8| refine_match(&images[0], second, &views[0], &views[1], &m);
+        assert!(refine(&images[1]).is_some());
+        assert_eq!(refine(&GrayU8::new(320, 240, [90])), None);
+        assert_eq!(refine(&GrayU8::new(320, 240, [255])), None);
+        let foreign = GrayU8::from_fn(320, 240, |x, y| [(((x / 3) * 7919 + (y / 3) * 104_729) % 200) as u8]);
+        assert_eq!(refine(&foreign), None);
+        // Off by more than a correction may be.
+        let far = Correspondence { b: m.b + Vector2::new(6.0, 0.0), ..m };
+        assert_eq!(refine_match(&images[0], &images[1], &views[0], &views[1], &far), None);
+    }
+
+    #[test]
+    fn an_alignment_of_inexact_matches_is_refined() {
+        let truth = views();
+        let images = images(&truth);
+        let size = (320, 240);
+        let pairs: Vec<VerifiedPair> = [(0, 1), (1, 2)]
+            .map(|(i, j)| {
+                verify_pair((i, size), (j, size), &matches(&truth[i], &truth[j], 0.7), &VerifyOptions::default())
+                    .unwrap()
+            })
+            .to_vec();
+        let photos = vec![Photo::new(320, 240); 3];
+        let options = AlignOptions { motion: CameraMotion::Rotation, ..AlignOptions::default() };
+        let rough = align(&photos, &pairs, &options, &Silent).unwrap();
+        let refined = refine_alignment(&images, &photos, &pairs, rough.clone(), &options, &Silent).unwrap();
+        // Angle of the relative rotation of the outer two, and the focal length, against the truth.
+        let error = |found: &Alignment| {
+            let [a, b] = [0, 2].map(|i| found.views[i].unwrap());
+            let off: Matrix3<f64> = b.from_world
+                * a.from_world.transpose()
+                * (truth[2].from_world * truth[0].from_world.transpose()).transpose();
+            (Vector3::new(off[(2, 1)], off[(0, 2)], off[(1, 0)]).norm() * 300.0, (a.camera.fx - 300.0).abs())
+        };
+        let (before, after) = (error(&rough), error(&refined));
+        // Errors of up to 0.1 px in place of ±0.7 (0.4 of standard deviation) along each axis, of as many matches.
+        assert!(after.0 < 0.25 * before.0.max(0.5) && after.1 < 0.25 * before.1.max(0.5), "{before:?} {after:?}");
+        assert_eq!(refined.pairs.len(), rough.pairs.len());
+        assert_eq!(refined.pairs[0].matches, rough.pairs[0].matches);
+        // Without pixels nothing changes.
+        let blank = vec![GrayU8::new(320, 240, [9]); 3];
+        let same = refine_alignment(&blank, &photos, &pairs, rough.clone(), &options, &Silent).unwrap();
+        assert!((same.rms_px - rough.rms_px).abs() < 1e-3);
+        let stopped = refine_alignment(&images, &photos, &pairs, rough, &options, &StopAt::report(3));
+        assert_eq!(stopped.unwrap_err(), Cancelled);
+    }
+}

@@ -1,0 +1,136 @@
+//! A canonical order of the photographs, by their pixels: the panorama is the same, byte for byte, in whatever order they are given.
+
+use crate::panorama::{LeftOut, PanoramaError, PanoramaImage, PanoramaPair, PanoramaResult};
+use cv_core::{Correspondence, DMatch, ImageView};
+use cv_panorama::{AlignedPair, Alignment, PhotoSample};
+use std::cmp::Ordering;
+
+/// A permutation of photographs.
+pub(super) struct Order {
+    /// Input index of each photograph in canonical order.
+    inputs: Vec<usize>,
+    /// The inverse: canonical index of each input.
+    canonical: Vec<usize>,
+}
+
+/// Rows between those that are hashed first.
+const ROW_STEP: usize = 16;
+
+impl Order {
+    /// Sorts photographs by size and by a hash of their pixels. O(pixels / 16) unless photographs are alike.
+    pub(super) fn of<T: PhotoSample>(photos: &[ImageView<'_, T, 3>]) -> Self {
+        let sparse: Vec<u64> = photos.iter().map(|photo| hash(photo, ROW_STEP)).collect();
+        let mut inputs: Vec<usize> = (0..photos.len()).collect();
+        inputs.sort_by(|&a, &b| {
+            let by_size = photos[a].size().cmp(&photos[b].size()).then(sparse[a].cmp(&sparse[b]));
+            if by_size == Ordering::Equal { hash(&photos[a], 1).cmp(&hash(&photos[b], 1)) } else { by_size }
+        });
+        let mut canonical = vec![0; inputs.len()];
+        inputs.iter().enumerate().for_each(|(k, &i)| canonical[i] = k);
+        Self { inputs, canonical }
+    }
+
+    /// Items of the inputs, in canonical order.
+    pub(super) fn sorted<U: Copy>(&self, items: &[U]) -> Vec<U> {
+        self.inputs.iter().map(|&i| items[i]).collect()
+    }
+
+    /// An alignment of the inputs, in canonical order.
+    pub(super) fn sorted_alignment(&self, alignment: Alignment) -> Alignment {
+        renumbered(alignment, &self.canonical)
+    }
+
+    /// Items in canonical order, in the order of the inputs.
+    fn restored<U>(&self, items: Vec<U>) -> Vec<U> {
+        permuted(items, &self.inputs)
+    }
+
+    fn restored_images(&self, images: Vec<PanoramaImage>) -> Vec<PanoramaImage> {
+        let mut images = self.restored(images);
+        for image in &mut images {
+            if let Some(LeftOut::NoOverlap { nearest: Some(nearest) }) = &mut image.reason {
+                nearest.other = self.inputs[nearest.other];
+            }
+        }
+        images
+    }
+
+    /// A result in canonical order, in the order of the inputs.
+    pub(super) fn restored_result<T>(&self, result: PanoramaResult<T>) -> PanoramaResult<T> {
+        let PanoramaResult { mut labels, mut map, .. } = result;
+        for label in labels.as_mut_slice() {
+            *label = self.inputs.get(usize::from(*label)).map_or(*label, |&i| i as u16);
+        }
+        map.renumber(&self.inputs);
+        let features = if result.features.is_empty() { Vec::new() } else { self.restored(result.features) };
+        let mut pairs: Vec<PanoramaPair> = result.pairs.into_iter().map(|pair| self.restored_pair(pair)).collect();
+        pairs.sort_by_key(|pair| (pair.a, pair.b));
+        PanoramaResult {
+            labels,
+            map,
+            features,
+            pairs,
+            images: self.restored_images(result.images),
+            alignment: renumbered(result.alignment, &self.inputs),
+            ..result
+        }
+    }
+
+    /// An error in canonical order, in the order of the inputs.
+    pub(super) fn restored_error(&self, error: PanoramaError) -> PanoramaError {
+        match error {
+            PanoramaError::Align { source, images } => {
+                PanoramaError::Align { source, images: self.restored_images(images) }
+            }
+            other => other,
+        }
+    }
+
+    fn restored_pair(&self, mut pair: PanoramaPair) -> PanoramaPair {
+        (pair.a, pair.b) = (self.inputs[pair.a], self.inputs[pair.b]);
+        if pair.a > pair.b {
+            (pair.a, pair.b) = (pair.b, pair.a);
+            for m in &mut pair.matches {
+                *m = DMatch { query: m.train, train: m.query, ..*m };
+            }
+        }
+        pair
+    }
+}
+
+/// FNV-1a of the size and the samples of every `step`-th row.
+fn hash<T: PhotoSample>(photo: &ImageView<'_, T, 3>, step: usize) -> u64 {
+    let mut hash = 0xcbf2_9ce4_8422_2325_u64;
+    let mut add = |v: u64| hash = (hash ^ v).wrapping_mul(0x100_0000_01b3);
+    for y in (0..photo.height()).step_by(step) {
+        photo.row(y).iter().for_each(|v| add(v.to_f32() as u64));
+    }
+    hash
+}
+
+/// Moves item `k` to place `to[k]`.
+fn permuted<U>(items: Vec<U>, to: &[usize]) -> Vec<U> {
+    let mut keyed: Vec<(usize, U)> = to.iter().copied().zip(items).collect();
+    keyed.sort_by_key(|(place, _)| *place);
+    keyed.into_iter().map(|(_, item)| item).collect()
+}
+
+/// The alignment with photograph `k` as photograph `to[k]`; in each pair the first has the smaller index.
+fn renumbered(alignment: Alignment, to: &[usize]) -> Alignment {
+    let pair = |p: AlignedPair| {
+        let (a, b) = (to[p.a], to[p.b]);
+        if a < b {
+            return AlignedPair { a, b, ..p };
+        }
+        let matches = p.matches.iter().map(|m| Correspondence { a: m.b, b: m.a }).collect();
+        AlignedPair { a: b, b: a, matches, ..p }
+    };
+    let mut pairs: Vec<AlignedPair> = alignment.pairs.into_iter().map(pair).collect();
+    pairs.sort_by_key(|p| (p.a, p.b));
+    Alignment {
+        views: permuted(alignment.views, to),
+        reference: to.get(alignment.reference).copied().unwrap_or(alignment.reference),
+        pairs,
+        ..alignment
+    }
+}
