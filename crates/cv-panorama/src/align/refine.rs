@@ -274,8 +274,7 @@ fn gauss_newton_step(template: ImageView<'_, u8, 1>, patch: &[f32; WIDE * WIDE])
         return None;
     }
     let standard_error = (residual.max(0.0) / (n - 6.0) * inverse[(0, 0)].max(inverse[(1, 1)])).sqrt() / gain;
-    // (Not a number: not accepted.)
-    if !(standard_error < MAX_STANDARD_ERROR_PX) {
+    if standard_error.is_nan() || standard_error >= MAX_STANDARD_ERROR_PX {
         return None;
     }
     let step = Vector2::new(solution[0], solution[1]) / gain;
