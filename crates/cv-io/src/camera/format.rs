@@ -7,7 +7,7 @@ use cv_core::{Camera, Distortion, DistortionModel};
 use super::{CalibrationNote, CameraArray, RigFile};
 use crate::FormatError;
 
-/// What a reader is context beside the text, and what it has to say of it.
+/// Context of a reader: the image size if known, and the notes that it collects.
 pub(super) struct ReadContext {
     /// Width and height of the images, for files without them.
     pub(super) size: Option<(usize, usize)>,
@@ -54,7 +54,7 @@ pub(super) struct Format {
     pub(super) array_text: Option<Write<CameraArray>>,
 }
 
-/// A camera's lens by the simplest_distortion of the lens models that a format has.
+/// Converts a camera's distortion to the model with the fewest parameters among those of a format.
 pub(super) fn simplest_distortion(
     camera: &Camera,
     format: &'static str,

@@ -13,7 +13,7 @@ const NAME: &str = "COLMAP binary";
 /// Upper bound of the memory of a parsed file relative to its size: a minimal image record of 74 bytes takes about 300 in a half-full tree.
 const MEMORY_FACTOR: u64 = 5;
 
-/// ByteReader from the front.
+/// Reads little-endian values from the front of a slice.
 struct ByteReader<'a>(&'a [u8]);
 
 impl<'a> ByteReader<'a> {
