@@ -51,7 +51,7 @@ impl Arguments {
         options.set_named("exposure", &mut o.render.exposure)?;
         options.set("crop", &mut o.render.crop)?;
         options.set("scale", &mut o.render.resolution)?;
-        o.matching.features = FeatureOptions::from(feature_method(options)?).at_most(2000);
+        o.matching.features = PanoramaOptions::features(FeatureOptions::from(feature_method(options)?));
         options.set("seed", &mut o.verify.seed)?;
         let camera = camera.map(|camera| camera.get().camera);
         Ok(Self { options: o, camera, focal, registration: registration.transpose()?, run: Run::read(options)? })

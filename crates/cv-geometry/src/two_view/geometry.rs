@@ -59,7 +59,7 @@ pub fn estimate_two_view_geometry(
     }
     let mut geometry = result?;
     degeneracy.check(geometry.inliers.len(), options)?;
-    geometry.planar_ratio = degeneracy.planar as f64 / geometry.inliers.len() as f64;
+    geometry.planar_ratio = (degeneracy.planar as f64 / geometry.inliers.len() as f64).min(1.0);
     Ok(geometry)
 }
 
