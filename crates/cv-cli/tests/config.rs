@@ -64,7 +64,7 @@ fn what_the_file_has_wrong_is_named() {
         assert!(ran.code == Some(2) && ran.stdout.is_empty() && ran.stderr.contains(word), "{text}: {ran:?}");
     }
     config(folder.path(), "not valid TOML");
-    assert!(run(folder.path(), &ESTIMATE).stderr.contains("cv.toml is no TOML"));
+    assert!(run(folder.path(), &ESTIMATE).stderr.contains("cv.toml is not valid TOML"));
     let ran = run(folder.path(), &[&ESTIMATE[..], &["--config", "missing.toml"]].concat());
     assert!(ran.code == Some(1) && ran.stderr.contains("missing.toml"), "{ran:?}");
 }

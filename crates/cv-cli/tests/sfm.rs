@@ -226,7 +226,7 @@ fn what_makes_no_model_is_refused_with_its_reason() {
     };
     photographs(&at("turned"), "a", &scene, &(0..5).map(turned).collect::<Vec<_>>());
     let said = call("turned");
-    assert!(said.contains("two places") && said.contains("`cv panorama`"), "{said}");
+    assert!(said.contains("parallax") && said.contains("`cv panorama`"), "{said}");
 }
 
 #[test]
@@ -545,7 +545,7 @@ fn photographs_are_added_to_a_model() {
     };
     refuse(&["photos", "-o", "new", "--from", "nowhere"], "nowhere");
     let then = ["photos/then00.png", "photos/then01.png", "-o", "new", "--from", "start"];
-    refuse(&then, "0 of the 8 photographs of start are among those given");
+    refuse(&then, "0 of the 8 photographs of the model start are among the arguments");
     refuse(&["photos", "-o", "new", "--from", "start", "--focal", "330"], "cannot be used with");
     assert!(!at("new").exists());
 }

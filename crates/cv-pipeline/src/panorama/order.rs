@@ -3,7 +3,6 @@
 use crate::panorama::{LeftOut, PanoramaError, PanoramaImage, PanoramaPair, PanoramaResult};
 use cv_core::{Correspondence, DMatch, ImageView};
 use cv_panorama::{AlignedPair, Alignment, PhotoSample};
-use std::cmp::Ordering;
 
 /// A permutation of photographs.
 pub(super) struct Order {
@@ -17,13 +16,17 @@ pub(super) struct Order {
 const ROW_STEP: usize = 16;
 
 impl Order {
-    /// Sorts photographs by size and by a hash of their pixels. O(pixels / 16) unless photographs are alike.
+    /// Sorts photographs by size and by a hash of their pixels, rounded to 8 bits: the order, and with it the choice
+    /// between equally good solutions, does not depend on the bit depth. O(pixels / 16) unless photographs are alike.
     pub(super) fn of<T: PhotoSample>(photos: &[ImageView<'_, T, 3>]) -> Self {
-        let sparse: Vec<u64> = photos.iter().map(|photo| hash(photo, ROW_STEP)).collect();
+        let rounded = |v: T| (v.to_f32() * (255.0 / T::WHITE.to_f32())).round() as u64;
+        let exact = |v: T| v.to_f32() as u64;
+        let sparse: Vec<u64> = photos.iter().map(|photo| hash(photo, ROW_STEP, rounded)).collect();
         let mut inputs: Vec<usize> = (0..photos.len()).collect();
         inputs.sort_by(|&a, &b| {
-            let by_size = photos[a].size().cmp(&photos[b].size()).then(sparse[a].cmp(&sparse[b]));
-            if by_size == Ordering::Equal { hash(&photos[a], 1).cmp(&hash(&photos[b], 1)) } else { by_size }
+            let whole = |value: &dyn Fn(T) -> u64| hash(&photos[a], 1, value).cmp(&hash(&photos[b], 1, value));
+            let by_rows = photos[a].size().cmp(&photos[b].size()).then(sparse[a].cmp(&sparse[b]));
+            by_rows.then_with(|| whole(&rounded)).then_with(|| whole(&exact))
         });
         let mut canonical = vec![0; inputs.len()];
         inputs.iter().enumerate().for_each(|(k, &i)| canonical[i] = k);
@@ -98,12 +101,12 @@ impl Order {
     }
 }
 
-/// FNV-1a of the size and the samples of every `step`-th row.
-fn hash<T: PhotoSample>(photo: &ImageView<'_, T, 3>, step: usize) -> u64 {
+/// Returns the FNV-1a hash of the values of the samples in every `step`-th row.
+fn hash<T: PhotoSample>(photo: &ImageView<'_, T, 3>, step: usize, value: impl Fn(T) -> u64) -> u64 {
     let mut hash = 0xcbf2_9ce4_8422_2325_u64;
     let mut add = |v: u64| hash = (hash ^ v).wrapping_mul(0x100_0000_01b3);
     for y in (0..photo.height()).step_by(step) {
-        photo.row(y).iter().for_each(|v| add(v.to_f32() as u64));
+        photo.row(y).iter().for_each(|v| add(value(*v)));
     }
     hash
 }
