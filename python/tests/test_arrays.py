@@ -62,7 +62,7 @@ def test_read_only_arrays_and_other_libraries_arrays(pair):
         (np.zeros((0, 5), np.uint8), errors.ShapeError, "no pixels"),
         (np.zeros((), np.uint8), errors.ShapeError, "shape"),
         (np.zeros(7, np.uint8), errors.ShapeError, "shape"),
-        (np.zeros((4, 4, 4), np.uint8), errors.ShapeError, "opacity"),
+        (np.zeros((4, 4, 4), np.uint8), errors.ShapeError, "alpha"),
         (np.zeros((4, 4, 2), np.uint8), errors.ShapeError, "height, width"),
         (np.zeros((2, 4, 4, 3), np.uint8), errors.ShapeError, "height, width"),
         (np.zeros((40, 40), np.float64), TypeError, "float64"),

@@ -26,7 +26,10 @@ pub(crate) fn run(release: bool) -> Result<bool> {
     let own = programs.join(format!("python{}", std::env::consts::EXE_SUFFIX));
     let pip = |arguments: &[&str]| {
         let mut command = Command::new(&own);
-        command.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check"]).args(arguments);
+        // Byte code is compiled for the modules that are imported: that of all of Ray and SciPy takes two minutes.
+        command
+            .args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile"])
+            .args(arguments);
         command
     };
     let sources = root().join("python");

@@ -114,7 +114,7 @@ const THRESHOLD_SIGMAS: f64 = 5.0;
 const MIN_THRESHOLD_RATIO: f64 = 0.01;
 
 /// Estimates the similarity from a model's frame to that of the measurements. The vertical comes from the images
-/// ([`upright`]), the scale from known distances, or all of it from known centers.
+/// ([`upright_frame`]), the scale from known distances, or all of it from known centers.
 ///
 /// Known centers (GPS errors are of meters, with gross outliers) are fitted by a robust similarity
 /// ([`estimate_similarity`]) whose threshold is estimated from the residuals. Collinear centers, as along a street,
