@@ -177,8 +177,19 @@ class ColorModel:
         return [work(photograph) for photograph in photographs]
 
 
-def _sigmoid(odds: Any) -> Any:
-    return (1.0 / (1.0 + np.exp(-odds.astype(np.float64)))).astype(np.float32)
+_BLOCK_ROWS = 256
+
+
+def _sigmoid(log_odds: Any) -> Any:
+    """Returns 1 / (1 + exp(-x)) in float32, by blocks of rows: between them, Ctrl-C is handled, and float64 copies stay small."""
+    odds = np.atleast_1d(log_odds)
+    probability = np.empty(odds.shape, np.float32)
+    # exp overflows to infinity below -709, and the quotient is 0.
+    with np.errstate(over="ignore"):
+        for row in range(0, len(odds), _BLOCK_ROWS):
+            rows = slice(row, row + _BLOCK_ROWS)
+            probability[rows] = 1.0 / (1.0 + np.exp(-odds[rows].astype(np.float64)))
+    return probability.reshape(np.shape(log_odds))
 
 
 def _not_fitted() -> Exception:

@@ -254,7 +254,7 @@ impl Predict {
             image["score"] = json!(best.and_then(|b| b.score));
             image["objects"] = result.objects.iter().map(region_json).collect();
             // Measures of the best region; null if it is not accepted as the object.
-            for key in ["box", "center", "area", "axes", "angle"] {
+            for key in ["box", "center", "area", "axes", "angle_degrees"] {
                 image[key] = if is_found { image["objects"][0][key].clone() } else { Value::Null };
             }
             images.push(image);
@@ -328,7 +328,7 @@ fn row(path: &Path, best: Option<&Detection>) -> Vec<String> {
     row
 }
 
-/// Returns a region as JSON: box `[x, y, width, height]`, center, area and semi-axes in pixels, angle in radians, color in nats, extent and axis ratio from 0 to 1.
+/// Returns a region as JSON: box `[x, y, width, height]`, center, area and semi-axes in pixels, angle in degrees, color in nats, extent and axis ratio from 0 to 1.
 fn region_json(object: &Detection) -> Value {
     let region = &object.region;
     json!({
@@ -338,7 +338,7 @@ fn region_json(object: &Detection) -> Value {
         "center": [region.center.x, region.center.y],
         "area": region.area,
         "axes": region.axes,
-        "angle": region.angle,
+        "angle_degrees": region.angle.to_degrees(),
         "truncated": region.truncated,
         "color": object.color,
         "extent": region.extent(),

@@ -10,7 +10,7 @@ pub(super) fn deviations(covariance: &ModelCovariance, names: &[&str], unit: &Va
     let images = names.iter().zip(&covariance.poses).filter_map(|(name, pose)| {
         let pose = pose.as_ref()?;
         let (center, rotation) = (roots(&pose.center, 1.0), roots(&pose.rotation, 1f64.to_degrees()));
-        Some(json!({ "name": name, "center": center, "rotation_deg": rotation }))
+        Some(json!({ "name": name, "center": center, "rotation_degrees": rotation }))
     });
     // The ids of a model's points start at 1.
     let points = covariance.points.iter().zip(1u64..).map(|(point, id)| {
