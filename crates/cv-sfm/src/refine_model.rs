@@ -50,21 +50,30 @@ pub(crate) fn refine_model(
             scene.set_tracks(tracks);
         }
     }
-    adjust_and_filter(scene, lens, FINE, options, progress)?;
-    let last_freedom = match is_uncalibrated {
-        true => LensFreedom::PrincipalPoint,
-        false if scene.knowledge.contains(&CameraKnowledge::Matrix) => LensFreedom::Distortion,
-        false => return Ok(()),
-    };
-    let previous = scene.solution();
-    let before = noise_scale(scene);
-    adjust_and_filter(scene, last_freedom, COARSE, options, progress)?;
-    let is_better = is_uncalibrated || noise_scale(scene) < MAX_DISTORTION_ERROR_RATIO * before;
-    if is_better {
-        adjust_and_filter(scene, last_freedom, FINE, options, progress)?;
-    }
-    if !is_better || is_uncalibrated && !scene.cameras.iter().all(is_principal_point_plausible) {
+    if is_uncalibrated {
+        let previous = scene.solution();
+        let mut is_plausible = true;
+        for effort in [COARSE, FINE] {
+            if is_plausible {
+                adjust_and_filter(scene, LensFreedom::PrincipalPoint, effort, options, progress)?;
+                is_plausible = scene.cameras.iter().all(is_principal_point_plausible);
+            }
+        }
+        if is_plausible {
+            return Ok(());
+        }
         scene.restore(previous);
+    }
+    adjust_and_filter(scene, lens, FINE, options, progress)?;
+    if !is_uncalibrated && scene.knowledge.contains(&CameraKnowledge::Matrix) {
+        let previous = scene.solution();
+        let before = noise_scale(scene);
+        adjust_and_filter(scene, LensFreedom::Distortion, COARSE, options, progress)?;
+        if noise_scale(scene) < MAX_DISTORTION_ERROR_RATIO * before {
+            adjust_and_filter(scene, LensFreedom::Distortion, FINE, options, progress)?;
+        } else {
+            scene.restore(previous);
+        }
     }
     Ok(())
 }
