@@ -9,7 +9,7 @@ use std::fs;
 use support::{json, refused, run};
 
 #[test]
-fn what_is_no_board_is_said_to_be_none_and_nothing_is_written() {
+fn photographs_without_a_board_are_refused_and_nothing_is_written() {
     let folder = tempfile::tempdir().unwrap();
     let gray = GrayU8::new(160, 120, [90]);
     for name in ["a1.png", "a2.png", "b1.png"] {
@@ -30,7 +30,7 @@ fn what_is_no_board_is_said_to_be_none_and_nothing_is_written() {
 }
 
 #[test]
-fn a_camera_goes_through_every_format_and_takes_the_lens_out() {
+fn a_camera_round_trips_through_every_format_and_undistorts() {
     let folder = tempfile::tempdir().unwrap();
     let camera = "schema: cv-camera/1\nwidth: 160\nheight: 120\nfx: 130.25\nfy: 131\ncx: 80\ncy: 59.5\n\
                   distortion: radial_tangential4\ncoefficients: [-0.2, 0.05, 0.001, -0.002]\n";
@@ -65,7 +65,7 @@ fn a_camera_goes_through_every_format_and_takes_the_lens_out() {
 }
 
 #[test]
-fn boards_are_drawn_the_same_each_time_in_every_format() {
+fn boards_are_drawn_deterministically_in_every_format() {
     let folder = tempfile::tempdir().unwrap();
     let draw = |file: &str, more: &[&str]| {
         let args = [&["board", "-o", file, "--board", "9x6", "--square", "20"], more].concat();
@@ -91,7 +91,7 @@ fn boards_are_drawn_the_same_each_time_in_every_format() {
 }
 
 #[test]
-fn a_sheet_that_was_drawn_is_no_rig_and_one_camera_none_either() {
+fn a_board_sheet_or_a_single_camera_is_refused_as_a_rig() {
     let folder = tempfile::tempdir().unwrap();
     let board = ["--kind", "aprilgrid", "--board", "3x2", "--marker", "40"];
     support::done(folder.path(), &[&["board", "-o", "1.png", "--dpi", "60"], &board[..]].concat());

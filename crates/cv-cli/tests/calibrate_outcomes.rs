@@ -50,7 +50,7 @@ fn one_view_and_photographs_of_different_sizes_are_too_few() {
 }
 
 #[test]
-fn mirrored_boards_two_at_once_and_the_dark_are_told_apart() {
+fn mirrored_boards_two_boards_and_dark_images_are_reported_differently() {
     let folder = tempfile::tempdir().unwrap();
     let photo = sheet(folder.path(), &BOARD);
     let (width, height) = photo.size();
@@ -73,7 +73,7 @@ fn mirrored_boards_two_at_once_and_the_dark_are_told_apart() {
 }
 
 #[test]
-fn boards_that_look_the_same_after_half_a_turn_are_found_as_they_are() {
+fn boards_with_a_rotational_symmetry_of_180_degrees_are_detected() {
     let folder = tempfile::tempdir().unwrap();
     for size in ["8x6", "7x7"] {
         let photo = sheet(folder.path(), &["--board", size, "--square", "20"]);
@@ -87,7 +87,7 @@ fn boards_that_look_the_same_after_half_a_turn_are_found_as_they_are() {
 }
 
 #[test]
-fn calibrations_that_are_broken_or_bombs_are_refused() {
+fn malformed_calibration_files_and_entity_bombs_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let camera = "schema: cv-camera/1\nwidth: 160\nheight: 120\nfx: 130.25\nfy: 131\ncx: 80\ncy: 59.5\n";
     fs::write(folder.path().join("good.yaml"), camera).unwrap();

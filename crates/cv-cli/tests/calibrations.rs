@@ -89,7 +89,7 @@ fn rectified(files: &[&str]) -> Value {
 }
 
 #[test]
-fn rigs_of_kalibr_and_of_opencv_in_two_files() {
+fn rigs_of_kalibr_and_opencv_in_two_files_are_read() {
     let [intrinsics, extrinsics] = opencv_files();
     let both = rectified(&[&intrinsics, &extrinsics]);
     let kalibr = rectified(&[KALIBR]);
@@ -108,7 +108,7 @@ fn rigs_of_kalibr_and_of_opencv_in_two_files() {
 }
 
 #[test]
-fn half_a_rig_is_told_where_the_other_half_is_looked_for() {
+fn an_incomplete_opencv_rig_names_the_missing_file() {
     let [intrinsics, extrinsics] = opencv_files();
     for half in [&intrinsics, &extrinsics] {
         let folder = tempfile::tempdir().unwrap();
@@ -122,7 +122,7 @@ fn half_a_rig_is_told_where_the_other_half_is_looked_for() {
 }
 
 #[test]
-fn a_bare_matrix_has_the_size_of_the_photographs_and_hardly_any_skew() {
+fn a_bare_matrix_takes_the_size_of_the_photographs_and_only_a_small_skew() {
     let folder = tempfile::tempdir().unwrap();
     write_matches(folder.path());
     let size = ["--size", "640x480"];
@@ -148,7 +148,7 @@ fn a_bare_matrix_has_the_size_of_the_photographs_and_hardly_any_skew() {
 }
 
 #[test]
-fn a_lens_that_is_not_known_is_named_with_those_that_are() {
+fn an_unknown_lens_model_is_refused_with_the_list_of_known_ones() {
     let folder = tempfile::tempdir().unwrap();
     write_matches(folder.path());
     let size = ["--size", "640x480"];

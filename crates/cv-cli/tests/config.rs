@@ -23,7 +23,7 @@ fn config(folder: &Path, text: &str) {
 const ESTIMATE: [&str; 4] = ["estimate", "homography", "--matches", "m.txt"];
 
 #[test]
-fn options_of_the_file_hold_and_the_command_line_wins() {
+fn the_command_line_overrides_the_configuration_file() {
     let folder = folder();
     let folder = folder.path();
     let said = |more: &[&str]| done(folder, &[&ESTIMATE[..], more].concat()).stderr;
@@ -47,7 +47,7 @@ fn options_of_the_file_hold_and_the_command_line_wins() {
 }
 
 #[test]
-fn what_the_file_has_wrong_is_named() {
+fn errors_of_the_configuration_file_name_the_entry() {
     let folder = folder();
     for (text, word) in [
         ("[estimate]\ntreshold = 1\n", "“treshold”"),
@@ -70,7 +70,7 @@ fn what_the_file_has_wrong_is_named() {
 }
 
 #[test]
-fn what_holds_is_printed_as_a_file_that_gives_it() {
+fn the_effective_configuration_is_printed_as_a_valid_file() {
     let folder = folder();
     let folder = folder.path();
     config(folder, "threads = 2\n[depth]\ndisparities = \"auto\"\nno-fill = true\n");

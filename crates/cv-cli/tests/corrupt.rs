@@ -13,7 +13,7 @@ use support::{done, fixture, run, snapshot};
 const RUNS: u64 = 8;
 
 #[test]
-fn damaged_inputs_are_read_or_refused_and_nothing_else() {
+fn damaged_inputs_are_read_or_refused_without_a_crash() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     for side in ["left", "right"] {

@@ -79,7 +79,7 @@ fn a_generated_pair_becomes_disparity_depth_and_cloud() {
 }
 
 #[test]
-fn the_formats_hold_the_same_map() {
+fn every_output_format_has_the_same_map() {
     let folder = pair();
     for name in ["d.pfm", "d.npy", "d.png"] {
         done(folder.path(), &["depth", "left.png", "right.png", "-o", name, "--disparities", "48", "--quiet"]);
@@ -93,7 +93,7 @@ fn the_formats_hold_the_same_map() {
 }
 
 #[test]
-fn frames_come_out_as_pairs_do() {
+fn frames_of_a_sequence_equal_single_pairs() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);
     for side in ["left", "right"] {
@@ -121,7 +121,7 @@ fn frames_come_out_as_pairs_do() {
 
 /// Everything that a pair gives, frames give too.
 #[test]
-fn frames_of_a_rig_come_out_whole() {
+fn a_sequence_of_a_rig_has_every_output_of_each_frame() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);
     let camera = "{width: 240, height: 180, fx: 210, fy: 210, cx: 119.5, cy: 89.5, distortion: radial, coefficients: [-0.05, 0.01]}";
@@ -175,7 +175,7 @@ fn frames_of_a_rig_come_out_whole() {
 }
 
 #[test]
-fn the_range_can_be_found_from_the_pictures() {
+fn the_disparity_range_is_estimated_from_the_images() {
     let folder = pair();
     let value = json(folder.path(), &["depth", "left.png", "right.png", "-o", "d.pfm", "--disparities", "auto"]);
     assert!((20..=80).contains(&value["disparities"].as_u64().unwrap()), "{value}");
@@ -185,7 +185,7 @@ fn the_range_can_be_found_from_the_pictures() {
 }
 
 #[test]
-fn an_exchanged_pair_is_no_pair_whoever_finds_the_range() {
+fn a_swapped_pair_is_refused_with_any_choice_of_the_range() {
     let folder = pair();
     for range in ["auto", "48"] {
         let depth =
@@ -203,7 +203,7 @@ fn an_exchanged_pair_is_no_pair_whoever_finds_the_range() {
 }
 
 #[test]
-fn rows_that_are_a_little_apart_are_aligned() {
+fn a_small_vertical_disparity_is_corrected() {
     let folder = pair();
     let folder = folder.path();
     // Lower by 2 px in the middle, by 1.2 at the left border and by 2.8 at the right one.
@@ -236,7 +236,7 @@ fn rows_that_are_a_little_apart_are_aligned() {
 }
 
 #[test]
-fn frames_of_other_moments_are_not_paired() {
+fn sequences_with_unpaired_frames_are_refused() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);
     for (side, first) in [("left", 1), ("right", 2)] {
@@ -273,7 +273,7 @@ fn the_result_is_the_same_for_any_number_of_threads() {
 }
 
 #[test]
-fn a_range_far_from_zero_finds_what_lies_there() {
+fn a_disparity_range_far_from_zero_matches_objects_in_it() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);
     // The same pair with 60 columns cut off on the right of one and on the left of the other: 60 px more everywhere.
@@ -314,7 +314,7 @@ fn a_range_far_from_zero_finds_what_lies_there() {
 }
 
 #[test]
-fn what_cannot_be_done_is_said_and_nothing_is_written() {
+fn invalid_requests_are_refused_with_the_reason_and_nothing_is_written() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);
     cv_io::write_png(at("dot.png"), RgbU8::new(1, 1, [9; 3]).view()).unwrap();
@@ -347,7 +347,7 @@ fn what_cannot_be_done_is_said_and_nothing_is_written() {
 }
 
 #[test]
-fn what_a_disparity_is_worth_comes_out_too() {
+fn confidence_matched_mask_and_uncertainty_are_written() {
     let folder = pair();
     let ran = done(
         folder.path(),
@@ -389,7 +389,7 @@ fn what_a_disparity_is_worth_comes_out_too() {
 }
 
 #[test]
-fn costs_smoothing_ranges_and_memory_can_be_chosen() {
+fn costs_penalties_ranges_and_memory_are_options() {
     let folder = pair();
     let score = |more: &[&str]| {
         done(folder.path(), &[&["depth", "left.png", "right.png", "-o", "d.pfm"], more].concat());
@@ -413,7 +413,7 @@ fn costs_smoothing_ranges_and_memory_can_be_chosen() {
 }
 
 #[test]
-fn gray_and_sixteen_bits_match_as_color_does() {
+fn gray_and_16_bit_images_match_like_color() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);
     for side in ["left", "right"] {
@@ -433,7 +433,7 @@ fn gray_and_sixteen_bits_match_as_color_does() {
 }
 
 #[test]
-fn what_is_no_pair_is_refused_with_what_to_try() {
+fn images_that_are_no_rectified_pair_are_refused_with_a_remedy() {
     let folder = pair();
     cv_io::write_png(folder.path().join("gray.png"), RgbU8::new(240, 180, [99; 3]).view()).unwrap();
     for (left, right) in [("gray.png", "gray.png"), ("gray.png", "right.png")] {
@@ -477,7 +477,7 @@ fn peak_of_frames(frames: usize, more: &[&str]) -> f64 {
 
 #[test]
 #[cfg(target_os = "linux")]
-fn many_frames_take_the_memory_of_few() {
+fn memory_does_not_grow_with_the_number_of_frames() {
     let whole = ["--focal", "210", "--baseline", "0.25", "--depth", "z", "--cloud", "c", "--disparities", "64"];
     for more in [&[][..], &whole] {
         let (few, many) = (peak_of_frames(6, more), peak_of_frames(60, more));

@@ -60,7 +60,7 @@ fn an_essential_matrix_gives_the_pose() {
 }
 
 #[test]
-fn planes_and_scenes_with_depth() {
+fn planes_give_homographies_and_scenes_with_depth_fundamental_matrices() {
     let folder = tempfile::tempdir().unwrap();
     write(folder.path(), "deep.txt", &two_views(false));
     write(folder.path(), "flat.txt", &two_views(true));
@@ -93,7 +93,7 @@ fn random(n: usize, low: f64, high: f64) -> Vec<[f64; 4]> {
 }
 
 #[test]
-fn matches_that_determine_nothing_are_refused_with_the_reason() {
+fn degenerate_matches_are_refused_with_the_reason() {
     let folder = tempfile::tempdir().unwrap();
     let good = two_views(false);
     let exact: Vec<_> = two_views(true).into_iter().enumerate().filter(|(i, _)| i % 5 != 4).map(|r| r.1).collect();
@@ -154,7 +154,7 @@ fn matches_that_determine_nothing_are_refused_with_the_reason() {
 }
 
 #[test]
-fn wrong_matches_alone_are_no_more_than_chance() {
+fn random_matches_have_no_significant_model() {
     let folder = tempfile::tempdir().unwrap();
     write(folder.path(), "wrong.txt", &random(300, 0.0, 480.0));
     write(folder.path(), "right.txt", &two_views(false));

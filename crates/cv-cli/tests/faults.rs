@@ -77,7 +77,7 @@ fn write_old(folder: &Path, outputs: &[&str]) {
 }
 
 #[test]
-fn a_disk_that_is_full_leaves_old_outputs_whole_and_is_named() {
+fn a_full_disk_is_reported_and_leaves_old_outputs_unchanged() {
     for (args, outputs) in JOBS {
         let folder = tempfile::tempdir().unwrap();
         let folder = folder.path();
@@ -106,7 +106,7 @@ fn a_disk_that_is_full_leaves_old_outputs_whole_and_is_named() {
 }
 
 #[test]
-fn a_device_without_room_is_an_error_too() {
+fn a_full_device_is_reported_as_an_error() {
     for (args, outputs) in &JOBS[..3] {
         let folder = tempfile::tempdir().unwrap();
         inputs(folder.path());
@@ -132,7 +132,7 @@ fn a_device_without_room_is_an_error_too() {
 
 /// Folders of the kernel, where root cannot make a file either.
 #[test]
-fn where_nobody_may_write_nothing_is_begun() {
+fn an_unwritable_folder_is_refused_before_the_computation() {
     for (args, outputs) in JOBS {
         for place in ["/proc", "/sys/kernel", "/proc/self/fd"] {
             let folder = tempfile::tempdir().unwrap();
@@ -152,7 +152,7 @@ fn where_nobody_may_write_nothing_is_begun() {
 
 /// A file that opens and then fails: the first page of a process's memory is mapped nowhere.
 #[test]
-fn an_input_that_cannot_be_read_to_its_end_is_named() {
+fn an_input_with_a_read_error_is_named() {
     let folder = tempfile::tempdir().unwrap();
     inputs(folder.path());
     symlink("/proc/self/mem", folder.path().join("broken.png")).unwrap();
@@ -170,7 +170,7 @@ fn an_input_that_cannot_be_read_to_its_end_is_named() {
 
 /// Each of two runs writes whole files; who comes last stays.
 #[test]
-fn two_runs_on_one_output_leave_that_of_one_of_them() {
+fn concurrent_runs_leave_the_complete_output_of_one() {
     for (args, outputs) in &JOBS[..4] {
         let folder = tempfile::tempdir().unwrap();
         let folder = folder.path();

@@ -31,7 +31,7 @@ fn commands_within(folder: &std::path::Path, name: &str) -> Vec<Vec<String>> {
 }
 
 #[test]
-fn every_command_explains_itself_by_examples() {
+fn the_help_of_every_command_has_examples() {
     let folder = tempfile::tempdir().unwrap();
     for name in commands() {
         for path in commands_within(folder.path(), &name) {
@@ -47,7 +47,7 @@ fn every_command_explains_itself_by_examples() {
 }
 
 #[test]
-fn wrong_usage_is_exit_code_2_and_leaves_stdout_alone() {
+fn wrong_usage_is_exit_code_2_without_output_on_stdout() {
     let folder = tempfile::tempdir().unwrap();
     let cases: [&[&str]; 7] = [
         &[],
@@ -74,7 +74,7 @@ fn wrong_usage_is_exit_code_2_and_leaves_stdout_alone() {
 }
 
 #[test]
-fn the_thread_count_is_the_one_asked_for() {
+fn the_option_threads_sets_the_thread_count() {
     let folder = tempfile::tempdir().unwrap();
     for threads in [1, 3] {
         let value = json(folder.path(), &["completions", "zsh", "--threads", &threads.to_string()]);
@@ -100,7 +100,7 @@ fn a_closed_stdout_is_a_failure_and_not_a_crash() {
 
 /// A global option that a command takes changes what it does, or it is refused: `--seed` and `--report` mean nothing to some.
 #[test]
-fn options_that_mean_nothing_are_refused() {
+fn options_without_effect_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let matches: String = (0..40)
         .map(|i| (f64::from(i * 37 % 97), f64::from(i * 53 % 89)))
@@ -129,7 +129,7 @@ fn options_that_mean_nothing_are_refused() {
 }
 
 #[test]
-fn a_file_beyond_the_memory_allowed_is_refused_with_a_number_that_suffices() {
+fn a_file_above_the_memory_limit_is_refused_with_a_sufficient_limit() {
     let folder = tempfile::tempdir().unwrap();
     // 2 MB as a file, as much again as a picture.
     let mut map = b"Pf\n800 700\n-1\n".to_vec();

@@ -64,7 +64,7 @@ fn shell(folder: &Path, text: &str) -> (Option<i32>, String) {
 }
 
 #[test]
-fn every_command_of_the_guides_does_what_they_say() {
+fn every_command_of_the_guides_succeeds_with_the_stated_outputs() {
     let folder = tempfile::tempdir().unwrap();
     let mut commands = 0;
     for guide in GUIDES {
@@ -106,7 +106,7 @@ fn every_command_of_the_guides_does_what_they_say() {
 }
 
 #[test]
-fn every_link_and_picture_of_the_guides_is_there() {
+fn every_link_and_image_of_the_guides_exists() {
     let docs = root().join("docs");
     let architecture = ["architecture.md", "benchmarks.md", "real-data.md"].map(|name| docs.join(name));
     let pages: Vec<PathBuf> =
@@ -152,7 +152,7 @@ fn sources(folder: &Path, text: &mut String) {
 }
 
 #[test]
-fn the_messages_in_the_guide_to_failures_are_those_of_the_program() {
+fn the_messages_in_the_guide_to_failures_are_printed_by_the_program() {
     let mut code = String::new();
     sources(&root().join("crates"), &mut code);
     let page = read(&root().join("docs/when-it-fails.md"));
@@ -167,7 +167,7 @@ fn the_messages_in_the_guide_to_failures_are_those_of_the_program() {
 }
 
 #[test]
-fn the_options_in_the_tables_are_there() {
+fn the_options_in_the_tables_exist() {
     let folder = tempfile::tempdir().unwrap();
     let help: String = [
         "demo",

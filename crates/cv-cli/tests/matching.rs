@@ -42,7 +42,7 @@ fn along(rows: &[Vec<f64>], homography: &Matrix3<f64>, limit: f64) -> (usize, us
 }
 
 #[test]
-fn every_kind_of_features_follows_the_plane() {
+fn matches_of_every_feature_kind_agree_with_the_homography_of_a_plane() {
     let (folder, truth) = pair("plane");
     let homography = matrix(&truth["homography"]);
     for kind in [
@@ -74,7 +74,7 @@ fn every_kind_of_features_follows_the_plane() {
 }
 
 #[test]
-fn guided_matching_finds_more_and_leaves_out_what_disagrees() {
+fn guided_matching_adds_inliers_and_removes_outliers() {
     let (folder, truth) = pair("plane");
     let homography = matrix(&truth["homography"]);
     let file = folder.path().join("m.txt");
@@ -110,7 +110,7 @@ fn guided_matching_finds_more_and_leaves_out_what_disagrees() {
 }
 
 #[test]
-fn photographs_of_different_things_have_no_model() {
+fn unrelated_photographs_have_no_model() {
     let (folder, _) = pair("plane");
     let (other, _) = pair("two-view");
     fs::copy(other.path().join("b.jpg"), folder.path().join("other.jpg")).unwrap();
@@ -137,7 +137,7 @@ fn photographs_of_different_things_have_no_model() {
 }
 
 #[test]
-fn features_go_to_files_and_back() {
+fn saved_features_give_the_same_matches() {
     let (folder, _) = pair("plane");
     let at = |name: &str| -> PathBuf { folder.path().join(name) };
     for (kind, file) in [("sift", "a.rootsift.npy"), ("mops", "a.mops.npy"), ("harris", "a.patch.npy")] {
@@ -160,7 +160,7 @@ fn features_go_to_files_and_back() {
 }
 
 #[test]
-fn features_that_do_not_fit_are_refused() {
+fn incompatible_feature_files_are_refused() {
     let (folder, _) = pair("plane");
     let at = |name: &str| -> PathBuf { folder.path().join(name) };
     for kind in ["mops", "harris"] {
@@ -190,7 +190,7 @@ fn features_that_do_not_fit_are_refused() {
 }
 
 #[test]
-fn the_report_counts_what_was_left_out() {
+fn the_report_counts_dropped_features() {
     let (folder, _) = pair("plane");
     let args = ["match", "a.jpg", "b.jpg", "--features", "harris", "--report", "out"];
     let result = json(folder.path(), &args);

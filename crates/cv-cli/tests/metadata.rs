@@ -84,7 +84,7 @@ const CAMERA: &str = "schema: cv-camera/1\nwidth: 200\nheight: 150\nfx: 150\nfy:
     distortion: radial\ncoefficients: [-0.1, 0.01]\n";
 
 #[test]
-fn sixteen_bits_stay_sixteen_and_what_the_file_says_stays() {
+fn bit_depth_and_metadata_are_preserved() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     fs::write(at("rig.yaml"), RIG).unwrap();
@@ -137,7 +137,7 @@ fn a_panorama_has_the_exif_of_one_photograph_and_the_profile_of_all() {
 }
 
 #[test]
-fn a_panorama_of_sixteen_bits_has_sixteen_bits_and_what_the_files_say() {
+fn a_16_bit_panorama_has_16_bits_and_the_metadata_of_its_photographs() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     // The lowest bits say what no rounding to bytes keeps: a ramp over two levels.

@@ -44,7 +44,7 @@ fn alpha_is_transparent_where_no_photograph_reaches() {
 }
 
 #[test]
-fn an_exr_has_the_light_in_the_exposure_of_the_reference() {
+fn an_exr_has_the_radiance_at_the_exposure_of_the_reference() {
     let folder = tempfile::tempdir().unwrap();
     let (_, names) = landscape(folder.path(), 2, 1.0);
     let value = json(folder.path(), &["panorama", &names[0], &names[1], "-o", "light.exr", "--scale", "0.5"]);
@@ -60,7 +60,7 @@ fn an_exr_has_the_light_in_the_exposure_of_the_reference() {
 }
 
 #[test]
-fn a_photograph_on_its_side_changes_nothing() {
+fn exif_orientation_does_not_change_the_panorama() {
     let folder = tempfile::tempdir().unwrap();
     let mut sizes = Vec::new();
     for turned in [None, Some(0), Some(1), Some(2)] {
@@ -85,7 +85,7 @@ fn a_photograph_on_its_side_changes_nothing() {
 }
 
 #[test]
-fn the_mode_is_taken_told_and_checked() {
+fn the_mode_is_applied_reported_and_validated() {
     let folder = tempfile::tempdir().unwrap();
     // One flat picture, two parts of it: what a camera shows that was slid along a wall.
     let wall = cv_io::read_rgb(fixture("panorama/view1.jpg")).unwrap();
@@ -166,7 +166,7 @@ fn difference(picture: &RgbU8, vista: &Vista, ray: impl Fn(f64, f64) -> Vector3<
 }
 
 #[test]
-fn every_projection_shows_the_part_of_the_scene_that_was_asked_for() {
+fn every_projection_shows_the_requested_field_of_view() {
     let folder = tempfile::tempdir().unwrap();
     let (vista, names) = landscape(folder.path(), 4, 0.0);
     let go = |more: &[&str]| -> RgbU8 {
@@ -215,7 +215,7 @@ fn every_projection_shows_the_part_of_the_scene_that_was_asked_for() {
 }
 
 #[test]
-fn fields_of_view_that_make_no_sense_are_refused_with_their_numbers() {
+fn invalid_fields_of_view_are_refused_with_their_values() {
     let folder = tempfile::tempdir().unwrap();
     let views: Vec<String> =
         (0..3).map(|i| fixture(&format!("panorama/view{i}.jpg")).to_str().unwrap().to_owned()).collect();
@@ -270,7 +270,7 @@ fn the_order_of_the_files_does_not_change_a_byte() {
 }
 
 #[test]
-fn a_saved_registration_gives_the_same_bytes_and_serves_other_frames() {
+fn a_saved_registration_gives_the_same_bytes_and_renders_other_frames() {
     let folder = tempfile::tempdir().unwrap();
     let (_, names) = landscape(folder.path(), 3, 0.0);
     // A photograph that fits nowhere is part of the set.
@@ -313,7 +313,7 @@ fn a_saved_registration_gives_the_same_bytes_and_serves_other_frames() {
 }
 
 #[test]
-fn registrations_of_other_photographs_and_damaged_ones_are_refused() {
+fn registrations_of_other_photographs_and_damaged_registrations_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let (_, names) = landscape(folder.path(), 3, 0.0);
     done(
@@ -376,7 +376,7 @@ fn registrations_of_other_photographs_and_damaged_ones_are_refused() {
 }
 
 #[test]
-fn a_project_for_hugin_has_the_views_and_comes_back_as_a_registration() {
+fn a_hugin_project_has_the_views_and_is_read_as_a_registration() {
     let folder = tempfile::tempdir().unwrap();
     let (vista, names) = landscape(folder.path(), 3, 0.0);
     let photos = strs(&names);

@@ -9,7 +9,7 @@ use std::fs;
 use support::{JOBS, done, odd_name, refused, run, snapshot, strs, write_broken, write_cmyk, write_dressed};
 
 #[test]
-fn a_file_that_is_no_picture_is_named_and_refused() {
+fn a_file_that_is_not_an_image_is_refused_by_name() {
     for job in JOBS {
         let (folder, good) = job.folder();
         let broken = write_broken(folder.path(), &job.pictures()[0]);
@@ -27,7 +27,7 @@ fn a_file_that_is_no_picture_is_named_and_refused() {
 }
 
 #[test]
-fn the_same_picture_in_another_file_format_gives_the_same_bytes() {
+fn the_same_image_in_another_file_format_gives_the_same_bytes() {
     for job in JOBS {
         let (folder, _) = job.folder();
         let pictures = job.pictures();
@@ -53,7 +53,7 @@ fn the_same_picture_in_another_file_format_gives_the_same_bytes() {
 }
 
 #[test]
-fn gray_and_cmyk_pictures_are_taken() {
+fn gray_and_cmyk_images_are_accepted() {
     for job in JOBS {
         let (folder, _) = job.folder();
         for (kind, ending) in [("gray", "png"), ("gray16", "png"), ("cmyk", "jpg")] {
@@ -81,7 +81,7 @@ fn gray_and_cmyk_pictures_are_taken() {
 }
 
 #[test]
-fn tiny_and_featureless_pictures_get_an_answer() {
+fn tiny_and_featureless_images_give_a_result_or_an_error() {
     let noise = |w, h| RgbU8::from_fn(w, h, |x, y| [(x * 97 + y * 57) as u8, (x * y * 31) as u8, (x * 13 + y) as u8]);
     let odd: [(&str, RgbU8); 7] = [
         ("one.png", RgbU8::new(1, 1, [90, 120, 30])),
@@ -121,7 +121,7 @@ fn tiny_and_featureless_pictures_get_an_answer() {
 }
 
 #[test]
-fn a_picture_that_lies_about_its_turn_or_ends_in_rubbish_is_still_read() {
+fn an_image_with_trailing_bytes_is_read() {
     for job in JOBS {
         let (folder, good) = job.folder();
         done(folder.path(), &strs(&job.args(&good)));
@@ -152,7 +152,7 @@ fn names_with_spaces_and_other_scripts_work() {
 }
 
 #[test]
-fn webp_is_read_whole_and_what_is_none_is_refused() {
+fn webp_is_read_losslessly_and_truncated_files_are_refused() {
     let job = JOBS.iter().find(|job| job.name == "match").unwrap();
     let (folder, good) = job.folder();
     let mut inputs = Vec::new();
@@ -178,7 +178,7 @@ fn webp_is_read_whole_and_what_is_none_is_refused() {
 }
 
 #[test]
-fn a_fully_transparent_picture_is_read_by_its_colors() {
+fn a_fully_transparent_image_is_read_by_its_colors() {
     let clear: Image<u8, 4> = Image::new(32, 32, [10, 20, 30, 0]);
     for job in JOBS {
         let (folder, good) = job.folder();

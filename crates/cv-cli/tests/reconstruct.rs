@@ -24,7 +24,7 @@ fn two_views(folder: &Path) {
 }
 
 #[test]
-fn a_dense_cloud_comes_beside_the_sparse_one() {
+fn a_dense_cloud_is_written_with_the_sparse_one() {
     let folder = tempfile::tempdir().unwrap();
     two_views(folder.path());
     let args =
@@ -66,7 +66,7 @@ fn photographs(folder: &Path, scene: &Scene, poses: [Pose; 2]) {
 }
 
 #[test]
-fn what_cannot_be_dense_is_refused_and_nothing_is_written() {
+fn a_pair_without_a_dense_cloud_is_refused_and_nothing_is_written() {
     let folder = tempfile::tempdir().unwrap();
     let scene = Scene::room(3);
     let first = scene.viewpoint();
@@ -85,7 +85,7 @@ fn what_cannot_be_dense_is_refused_and_nothing_is_written() {
 }
 
 #[test]
-fn a_focal_length_that_was_estimated_is_said_with_its_deviation() {
+fn an_estimated_focal_length_is_reported_with_its_standard_deviation() {
     let folder = tempfile::tempdir().unwrap();
     two_views(folder.path());
     let args = ["reconstruct", "a.jpg", "b.jpg", "-o", "s.ply", "--report", "out"];

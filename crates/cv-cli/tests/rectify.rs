@@ -36,7 +36,7 @@ fn rig(vertical: bool) -> tempfile::TempDir {
 }
 
 #[test]
-fn a_turned_rig_is_rectified_with_a_printed_quality() {
+fn a_rotated_rig_is_rectified_and_its_quality_printed() {
     for vertical in [false, true] {
         let folder = rig(vertical);
         let run = |more: &[&str]| {
@@ -59,7 +59,7 @@ fn a_turned_rig_is_rectified_with_a_printed_quality() {
 }
 
 #[test]
-fn rigs_that_are_none_are_refused_and_nothing_is_written() {
+fn invalid_rigs_are_refused_and_nothing_is_written() {
     let folder = rig(false);
     let refuse = |rig: &str, more: &[&str]| {
         refused(folder.path(), &[&["rectify", "a.png", "b.png", "--rig", rig, "--out", "out"], more].concat()).stderr
@@ -93,7 +93,7 @@ fn rigs_that_are_none_are_refused_and_nothing_is_written() {
 }
 
 #[test]
-fn what_is_read_is_never_written_over() {
+fn inputs_are_never_overwritten() {
     let folder = rig(false);
     std::fs::rename(folder.path().join("a.png"), folder.path().join("left.png")).unwrap();
     std::fs::create_dir(folder.path().join("calibration")).unwrap();
@@ -111,7 +111,7 @@ fn what_is_read_is_never_written_over() {
 }
 
 #[test]
-fn photographs_that_do_not_fit_the_rig_are_told_from_those_without_features() {
+fn photographs_inconsistent_with_the_rig_and_without_features_have_different_errors() {
     for vertical in [false, true] {
         let folder = rig(vertical);
         let rectify = |a: &str, b: &str| {
@@ -144,7 +144,7 @@ fn photographs_that_do_not_fit_the_rig_are_told_from_those_without_features() {
 }
 
 #[test]
-fn the_rig_file_of_the_help_is_one() {
+fn the_rig_file_in_the_help_is_valid() {
     let folder = rig(false);
     let help = done(folder.path(), &["rectify", "--help"]).stdout;
     let file: Vec<&str> = help
@@ -173,7 +173,7 @@ fn positions(path: &std::path::Path) -> Vec<[f64; 3]> {
 }
 
 #[test]
-fn depth_by_a_rig_lies_on_the_scene_in_the_left_camera_s_frame() {
+fn depth_by_a_rig_is_accurate_in_the_left_camera_frame() {
     let camera = Camera::from_focal(320, 240, 280.0);
     for vertical in [false, true] {
         let folder = rig(vertical);
@@ -200,7 +200,7 @@ fn depth_by_a_rig_lies_on_the_scene_in_the_left_camera_s_frame() {
 }
 
 #[test]
-fn depth_by_a_rig_keeps_the_bits_of_the_photographs() {
+fn depth_by_a_rig_uses_the_full_bit_depth() {
     let folder = rig(false);
     let at = |name: &str| folder.path().join(name);
     for name in ["a", "b"] {
@@ -226,7 +226,7 @@ fn depth_by_a_rig_keeps_the_bits_of_the_photographs() {
 }
 
 #[test]
-fn a_picture_of_depths_is_in_millimeters_whatever_the_unit_of_the_rig() {
+fn a_depth_png_is_in_millimeters_for_every_unit_of_the_rig() {
     let folder = rig(false);
     let at = |name: &str| folder.path().join(name);
     let in_meters = cv_io::read_rig(at("rig.yaml"), None).unwrap();

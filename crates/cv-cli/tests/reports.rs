@@ -247,7 +247,7 @@ fn reports_work_in_a_browser() {
 }
 
 #[test]
-fn a_report_begins_with_the_warnings_of_the_run_and_ends_with_how_it_was_called() {
+fn a_report_starts_with_the_warnings_and_ends_with_the_command_line() {
     let folder = tempfile::tempdir().unwrap();
     // A third of the pair matches; the rest is noise that the other photograph does not confirm.
     let noise = |x: usize, y: usize, shift: usize| [(((x + shift) * 7919 + y * 104_729) % 251) as u8; 3];

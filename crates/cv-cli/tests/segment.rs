@@ -29,7 +29,7 @@ fn discs() -> tempfile::TempDir {
 }
 
 #[test]
-fn trained_predicted_and_scored() {
+fn training_prediction_and_evaluation_of_discs_succeed() {
     let discs = discs();
     let folder = discs.path();
     let train = ["segment", "train", "--images", "train", "--masks", "train", "--model", "m.json"];
@@ -122,7 +122,7 @@ fn bad_models_and_arguments_are_refused() {
 }
 
 #[test]
-fn another_shape_of_the_color_is_not_found() {
+fn an_object_of_the_same_color_and_another_shape_is_not_detected() {
     let discs = discs();
     let folder = discs.path();
     done(folder, &["segment", "train", "--images", "train", "--masks", "train", "--model", "m.json"]);

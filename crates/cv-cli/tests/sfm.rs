@@ -81,7 +81,7 @@ fn files(folder: &Path) -> Vec<String> {
 }
 
 #[test]
-fn a_walk_around_a_room_is_as_it_was_and_written_whole() {
+fn a_walk_around_a_room_is_reconstructed_and_written_completely() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let truth = photographs(&at("photos"), "walk", &Scene::room(4), &Scene::room_walk(12));
@@ -172,7 +172,7 @@ fn a_walk_around_a_room_is_as_it_was_and_written_whole() {
 }
 
 #[test]
-fn without_a_camera_the_focal_length_is_found() {
+fn an_unknown_focal_length_is_estimated() {
     let folder = tempfile::tempdir().unwrap();
     let truth = photographs(&folder.path().join("photos"), "walk", &Scene::room(4), &Scene::room_walk(12));
     let value = json(folder.path(), &["sfm", "photos", "-o", "model", "--quiet"]);
@@ -185,7 +185,7 @@ fn without_a_camera_the_focal_length_is_found() {
 }
 
 #[test]
-fn what_makes_no_model_is_refused_with_its_reason() {
+fn photographs_without_a_model_are_refused_with_the_reason() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let (scene, walk) = (Scene::room(4), Scene::room_walk(12));
@@ -230,7 +230,7 @@ fn what_makes_no_model_is_refused_with_its_reason() {
 }
 
 #[test]
-fn photographs_of_something_else_are_left_out() {
+fn unrelated_photographs_are_not_registered() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let mut truth = photographs(&at("photos"), "room", &Scene::room(4), &Scene::room_walk(12)[..5]);
@@ -308,7 +308,7 @@ fn off_by(model: &SparseModel, truth: &BTreeMap<String, Pose>) -> f64 {
 }
 
 #[test]
-fn models_are_brought_to_positions_known_places_and_distances() {
+fn models_are_aligned_to_gps_known_positions_and_distances() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let truth = photographs(&at("photos"), "walk", &Scene::room(4), &Scene::room_walk(12));
@@ -410,7 +410,7 @@ fn models_are_brought_to_positions_known_places_and_distances() {
 }
 
 #[test]
-fn places_that_mean_nothing_are_refused_before_the_work() {
+fn invalid_positions_are_refused_before_the_computation() {
     let folder = tempfile::tempdir().unwrap();
     for name in ["a.png", "b.png", "c.png"] {
         fs::write(folder.path().join(name), name).unwrap();
@@ -430,7 +430,7 @@ fn places_that_mean_nothing_are_refused_before_the_work() {
 }
 
 #[test]
-fn a_run_that_is_killed_goes_on_to_the_same_bytes() {
+fn a_resumed_run_gives_the_same_bytes() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     photographs(&at("photos"), "walk", &Scene::room(4), &Scene::room_walk(12)[..7]);
@@ -562,7 +562,7 @@ fn positions_and_normals(bytes: &[u8]) -> Vec<[[f32; 3]; 2]> {
 }
 
 #[test]
-fn a_dense_cloud_lies_on_the_surfaces() {
+fn points_of_a_dense_cloud_are_on_the_surfaces() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let (scene, walk) = (Scene::room(4), Scene::room_walk(48));

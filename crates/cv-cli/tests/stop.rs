@@ -86,7 +86,7 @@ fn was_stopped(Output { status, stdout, stderr }: Output, took: Duration, what: 
 }
 
 #[test]
-fn a_stopped_command_leaves_everything_as_it_was() {
+fn a_stopped_command_leaves_all_files_unchanged() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     write_inputs(folder, (2400, 1800), 30);
@@ -123,7 +123,7 @@ fn names(folder: &Path) -> Vec<String> {
 }
 
 #[test]
-fn what_is_being_written_is_removed() {
+fn an_output_in_progress_is_removed() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     write_inputs(folder, (2400, 1800), 30);
@@ -157,7 +157,7 @@ fn what_is_being_written_is_removed() {
 }
 
 #[test]
-fn frames_that_are_done_stay_and_are_whole() {
+fn completed_frames_are_kept() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     write_inputs(folder, (640, 480), 20);
@@ -183,7 +183,7 @@ fn frames_that_are_done_stay_and_are_whole() {
 }
 
 #[test]
-fn the_demo_stops_within_its_jobs() {
+fn the_demo_stops_within_a_job() {
     let folder = tempfile::tempdir().unwrap();
     for wait in [50, 700] {
         let child = start(folder.path(), &["demo"]);
@@ -198,7 +198,7 @@ fn the_demo_stops_within_its_jobs() {
 
 /// A pipe into which nobody writes keeps a command where no callback is asked; the program ends all the same.
 #[test]
-fn a_command_that_waits_for_its_input_stops_too() {
+fn a_command_that_waits_for_input_stops() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     write_inputs(folder, (64, 48), 3);

@@ -95,7 +95,7 @@ impl Set {
 const BOUND: Duration = Duration::from_millis(200);
 
 #[test]
-fn no_stage_goes_on_for_long_without_asking() {
+fn every_stage_checks_for_cancellation_regularly() {
     let set = Set::new(8, 1000);
     for &(_, blend) in BlendMode::NAMES {
         let (stage, gap) = set.longest_gap(blend);
@@ -106,7 +106,7 @@ fn no_stage_goes_on_for_long_without_asking() {
 
 #[test]
 #[ignore = "8 photographs of 12 megapixels: a minute and 4 GB"]
-fn no_stage_of_large_photographs_goes_on_for_long_without_asking() {
+fn every_stage_of_large_photographs_checks_for_cancellation_regularly() {
     let set = Set::new(8, 4000);
     for &(_, blend) in BlendMode::NAMES {
         let (stage, gap) = set.longest_gap(blend);
@@ -116,7 +116,7 @@ fn no_stage_of_large_photographs_goes_on_for_long_without_asking() {
 }
 
 #[test]
-fn once_told_to_stop_no_thread_goes_on() {
+fn every_thread_stops_after_cancellation() {
     let set = Set::new(4, 500);
     let whole = Asked::new(usize::MAX);
     set.render(BlendMode::Multiband, &whole).unwrap();

@@ -477,7 +477,7 @@ mod tests {
     }
 
     #[test]
-    fn a_project_has_the_angles_that_panorama_tools_mean() {
+    fn a_project_has_the_angles_of_panorama_tools() {
         // A camera turned to the right sees what lies there in its middle; one that is rolled clockwise sees what lies to the right below.
         let ahead = |r: f64, p: f64, y: f64, ray: Vector3<f64>| rotation(r, p, y) * ray;
         assert!((ahead(0.0, 0.0, 0.3, Vector3::new(0.3_f64.sin(), 0.0, 0.3_f64.cos())) - Vector3::z()).norm() < 1e-12);
@@ -514,7 +514,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_written_is_what_is_read(k1 in -0.2..0.2_f64, roll in -3.1..3.1_f64, pitch in -1.5..1.5_f64, yaw in -3.1..3.1_f64) {
+        fn projects_round_trip(k1 in -0.2..0.2_f64, roll in -3.1..3.1_f64, pitch in -1.5..1.5_f64, yaw in -3.1..3.1_f64) {
             let lens = Distortion::simple_radial(k1);
             let alignment = Alignment {
                 views: vec![Ok(view(roll, pitch, yaw, lens))],
@@ -536,7 +536,7 @@ mod tests {
     }
 
     #[test]
-    fn lenses_that_the_format_lacks_are_fitted_and_the_error_is_told() {
+    fn unsupported_lens_models_are_fitted_and_the_error_is_reported() {
         // A barrel that draws corners in by a tenth: the even powers of one polynomial by all of another. What is tangential is not written at all: a pixel and a half.
         for (lens, most) in [
             (Distortion::new(DistortionModel::Radial, &[-0.25, 0.08]).unwrap(), 0.3),
@@ -597,7 +597,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_registration_cannot_hold_is_refused_with_its_line() {
+    fn unsupported_entries_are_refused_with_their_line() {
         let go = |line: &str| Registration::from_pto(&format!("# hugin\n{line}\n")).unwrap_err();
         assert_eq!(Registration::from_pto("").unwrap_err(), PtoError::NoPhotographs);
         assert_eq!(go("i w3000 h2000 f0"), PtoError::Number { line: 2, key: "v" });
@@ -638,7 +638,7 @@ mod tests {
     }
 
     #[test]
-    fn the_canvas_of_a_project_has_our_pixels() {
+    fn the_canvas_of_a_project_has_the_same_pixels() {
         for (x, y, w, h) in
             [(-400.0, -250.5, 801, 502), (-17.0, 33.0, 400, 10), (12.5, -90.5, 7, 60), (-99.5, -1.0, 120, 90)]
         {
@@ -656,7 +656,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_circle_is_no_wider_than_one() {
+    fn the_width_of_a_full_circle_is_one_period() {
         let line = canvas_line(
             &Canvas { origin: Point2::new(-1570.0, -100.0), ..canvas(Projection::Cylindrical) },
             (3142, 200),

@@ -183,7 +183,7 @@ mod tests {
         }
 
         #[test]
-        fn a_row_of_shifts_is_the_field_at_each_pixel(y in 20..79_usize, left in 10..60_usize, spacing in 8.0..30.0_f64) {
+        fn displacements_of_a_row_equal_those_of_single_pixels(y in 20..79_usize, left in 10..60_usize, spacing in 8.0..30.0_f64) {
             let (mut us, mut vs) = (vec![5.0; 50], vec![-3.0; 50]);
             affine(spacing).add_row(y as f64, left as f64, &mut us, &mut vs);
             for (i, (u, v)) in us.iter().zip(&vs).enumerate() {
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn outside_the_grid_the_nearest_position_counts() {
+    fn the_field_is_extended_by_the_nearest_position() {
         let field = affine(10.0);
         let far = field.at(Point2::new(-1000.0, 50.0));
         assert!((far - field.at(Point2::new(field.left, 50.0))).norm() < 1e-9);
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn the_shift_of_the_source_undoes_the_displacement() {
+    fn the_source_displacement_inverts_the_field() {
         let surface = Surface { projection: Projection::Cylindrical, scale: 90.0 };
         let view = View {
             camera: Camera::from_focal(200, 150, 100.0),

@@ -522,7 +522,7 @@ mod tests {
     }
 
     #[test]
-    fn conjugate_gradients_find_the_direct_solution() {
+    fn conjugate_gradients_converge_to_the_direct_solution() {
         // A chain of springs of different strength, each vertex tied to zero.
         let n = 40;
         let mut matrix = DMatrix::<f64>::from_diagonal_element(n, n, 0.3);

@@ -173,7 +173,7 @@ mod tests {
     use cv_core::Camera;
 
     #[test]
-    fn a_frame_brings_what_is_asked_for_to_the_middle() {
+    fn the_requested_direction_is_at_the_center() {
         let framing = Framing { center: Some([0.3, 0.5]), ..Framing::default() };
         let (yaw, pitch) = (0.2 + 0.3_f64, 0.5_f64);
         // 0.5 rad above the horizon, Y pointing down, 0.3 to the right of a middle at 0.2.
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn angles_that_are_none_are_refused_by_name() {
+    fn invalid_angles_are_refused_by_name() {
         let name = |framing: Framing| framing.check().unwrap_err().name;
         assert_eq!(Framing::default().check(), Ok(()));
         assert_eq!(name(Framing { center: Some([f64::NAN, 0.0]), ..Framing::default() }), "yaw");
@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn the_boxes_are_those_of_all_that_is_seen() {
+    fn bounding_boxes_equal_those_of_dense_sampling() {
         // Ahead, behind, up, down, aside and aslant: over poles, cuts and points at infinity.
         let turns = [(0.0, 0.0), (3.1, 0.1), (0.3, 1.5), (2.0, -1.4), (1.5, 0.0), (-2.9, 0.7), (3.13, -0.6)];
         for projection in [
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn a_photograph_across_the_cut_has_a_box_on_either_side() {
+    fn a_photograph_across_the_cut_has_two_boxes() {
         let view = View {
             camera: Camera::from_focal(600, 400, 500.0),
             from_world: Rotation3::from_axis_angle(&Vector3::y_axis(), -3.0).into_inner(),

@@ -52,7 +52,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn heights_are_those_of_the_formula_and_end_at_a_square() {
+    fn heights_equal_the_formula_and_are_limited_to_a_square() {
         for degrees in [-80.0_f64, -30.0, 10.0, 60.0] {
             let (sin, cos) = degrees.to_radians().sin_cos();
             let p = Mercator.forward(&Vector3::new(0.6 * cos, sin, -0.8 * cos), 1.0).unwrap();

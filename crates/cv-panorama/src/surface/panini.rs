@@ -55,7 +55,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn places_are_those_of_the_formulas() {
+    fn positions_equal_the_formulas() {
         // λ = 90°, φ = 45°: S = 2, x = 2, y = 2. λ = 120°: S = 4, x = 4 sin 120° = 2 √3.
         let p = Panini.forward(&Vector3::new(1.0, 1.0, 0.0), 100.0).unwrap();
         assert!((p - Point2::new(200.0, 200.0)).norm() < 1e-9, "{p}");
@@ -68,11 +68,11 @@ mod tests {
 
     proptest! {
         #[test]
-        fn verticals_and_lines_towards_the_middle_are_straight(x in -3.0..3.0_f64, y in -2.0..2.0_f64, z in 0.2..3.0_f64, t in 0.1..5.0_f64) {
+        fn verticals_and_radial_lines_are_straight(x in -3.0..3.0_f64, y in -2.0..2.0_f64, z in 0.2..3.0_f64, t in 0.1..5.0_f64) {
             let at = |x: f64, y: f64, z: f64| Panini.forward(&Vector3::new(x, y, z), 1.0).unwrap();
-            // A vertical in the world is one of the picture.
+            // A vertical of the scene is vertical in the panorama.
             prop_assert!((at(x, y, z).x - at(x, y + t, z).x).abs() < 1e-12);
-            // A line parallel to the Z axis ends in the middle of the picture: its points lie on one ray from there.
+            // A line parallel to the z axis is a straight line through the center of the panorama.
             let (p, q) = (at(x, y, z), at(x, y, z + t));
             prop_assert!((p.x * q.y - p.y * q.x).abs() < 1e-12 * (1.0 + p.coords.norm_squared()), "{p} {q}");
         }

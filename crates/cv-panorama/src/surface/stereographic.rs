@@ -66,7 +66,7 @@ mod tests {
     proptest! {
         /// The circle of all directions at one angle from an axis is a circle on the plane: four of its points lie on one.
         #[test]
-        fn circles_stay_circles(yaw in -1.5..1.5_f64, pitch in -1.0..1.0_f64, radius in 0.05..0.5_f64) {
+        fn circles_are_mapped_to_circles(yaw in -1.5..1.5_f64, pitch in -1.0..1.0_f64, radius in 0.05..0.5_f64) {
             let turn = nalgebra::Rotation3::from_euler_angles(pitch, yaw, 0.0);
             let at = |phi: f64| {
                 let ray = Vector3::new(radius.sin() * phi.cos(), radius.sin() * phi.sin(), radius.cos());
