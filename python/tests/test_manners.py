@@ -32,7 +32,7 @@ def run(code, **options):
     ],
 )
 def test_control_c_stops_a_long_job_soon(job, seconds):
-    # Two pictures of 12 Mpx take seconds.
+    # Two images of 12 Mpx take seconds.
     found = run(
         f"""
         import os, signal, threading, time

@@ -48,7 +48,7 @@ def pairs(tmp_path_factory):
         for i in range(240):
             shutil.copy(folder / f"{side}.png", folder / f"{side}{i:03}.png")
     for i in CORRUPT:
-        (folder / f"left{i:03}.png").write_bytes(b"no picture")
+        (folder / f"left{i:03}.png").write_bytes(b"no image")
     return [(folder / f"left{i:03}.png", folder / f"right{i:03}.png") for i in range(240)]
 
 

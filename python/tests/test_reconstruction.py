@@ -137,7 +137,7 @@ def test_photographs_that_are_left_out_keep_their_names(photographs, tmp_path):
     bad = [tmp_path / folder / "bad.jpg" for folder in "xy"]
     for path in bad:
         path.parent.mkdir()
-        path.write_bytes(b"no picture")
+        path.write_bytes(b"no image")
     found = epipole.sfm([*photographs, *bad], camera=camera)
     assert list(found.left_out) == [str(path) for path in bad]
     seen = [epipole.sfm_features(photograph, name="one") for photograph in photographs]

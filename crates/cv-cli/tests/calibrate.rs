@@ -1,4 +1,4 @@
-//! `cv calibrate`, `cv undistort` and `cv calibration` from outside. What they do when all is well the guides show.
+//! `cv calibrate`, `cv undistort` and `cv calibration` as a black box. The guides test their ordinary use.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -20,7 +20,7 @@ fn photographs_without_a_board_are_refused_and_nothing_is_written() {
     let stereo = ["calibrate", "stereo", "--left", "a1.png", "a2.png", "--right", "b1.png", "-o", "out/rig.yaml"];
     assert!(refused(folder.path(), &stereo).stderr.contains("no board"));
     assert!(!folder.path().join("out").exists());
-    fs::write(folder.path().join("bad.png"), "no picture").unwrap();
+    fs::write(folder.path().join("bad.png"), "no image").unwrap();
     let bad = refused(folder.path(), &["calibrate", "mono", "a1.png", "bad.png", "-o", "cam.yaml"]);
     assert!(bad.stderr.contains("bad.png"), "{}", bad.stderr);
     for wrong in [["--board", "9"], ["--board", "2x2"], ["--square", "-1"], ["--lens", "round"], ["--outliers", "1"]] {
@@ -56,9 +56,9 @@ fn a_camera_round_trips_through_every_format_and_undistorts() {
         json(folder.path(), &["undistort", "photo.png", "--camera", "cam.yaml", "-o", "straight", "--alpha", "0"]);
     assert_eq!(done["width"], 160);
     let straight = cv_io::read_rgb(folder.path().join("straight/photo.png")).unwrap();
-    // Every pixel shows something: blue is the same everywhere, and black where the lens does not reach.
+    // A constant image: blue is the same at every pixel, and black where the lens has no ray.
     assert!(straight.size() == (160, 120) && straight.as_slice().chunks(3).all(|p| p[2].abs_diff(128) <= 1));
-    // Its camera has no lens to take out.
+    // The undistorted camera has no distortion.
     assert_eq!(shown("straight/camera.yaml")["lens"], "none");
     let again = run(folder.path(), &["undistort", "photo.png", "--camera", "cam.yaml", "-o", "."]);
     assert_eq!(again.code, Some(1), "{}", again.stderr);
@@ -77,7 +77,7 @@ fn boards_are_drawn_deterministically_in_every_format() {
         let first = draw(file, &[]);
         assert!(first.starts_with(begins) && first == draw(file, &[]), "{file}");
     }
-    // Its resolution: 11811 dots to the meter both ways, and that the unit is the meter.
+    // The pHYs chunk: 11811 dots per meter in both directions.
     let png = draw("a.png", &["--paper", "letter"]);
     let at = png.windows(4).position(|w| w == b"pHYs").unwrap();
     assert_eq!(png[at + 4..at + 13], [0, 0, 0x2e, 0x23, 0, 0, 0x2e, 0x23, 1]);
@@ -96,7 +96,7 @@ fn a_board_sheet_or_a_single_camera_is_refused_as_a_rig() {
     let board = ["--kind", "aprilgrid", "--board", "3x2", "--marker", "40"];
     support::done(folder.path(), &[&["board", "-o", "1.png", "--dpi", "60"], &board[..]].concat());
     let rig = [&["calibrate", "rig", "-o", "rig.yaml", "--cameras", "1.png", "1.png", "1.png"], &board[..]].concat();
-    // It is found on all three, and one view is too few.
+    // The board is detected in all three photographs, and the single view is too few.
     let said = refused(folder.path(), &rig).stderr;
     assert!(said.contains("on 1 photograph, 3 are needed"), "{said}");
     let one = [&["calibrate", "rig", "-o", "rig.yaml", "--cameras", "1.png"], &board[..]].concat();

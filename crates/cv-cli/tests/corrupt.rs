@@ -9,7 +9,7 @@ use cv_synth::corrupt;
 use std::fs;
 use support::{done, fixture, run, snapshot};
 
-/// Runs on damaged inputs, of each file.
+/// Number of damaged versions of each file.
 const RUNS: u64 = 8;
 
 #[test]

@@ -1,4 +1,4 @@
-//! What every command shares, seen from outside: usage, help, exit codes, stdout and stderr.
+//! Behavior common to all commands, as a black box: usage, help, exit codes, stdout and stderr.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -6,7 +6,7 @@ mod support;
 
 use support::{cv, done, json, refused, run};
 
-/// The names in the list of commands.
+/// Returns the names in the list of commands.
 fn commands() -> Vec<String> {
     let help = done(&std::env::temp_dir(), &["--help"]).stdout;
     let list = help.split("Commands:\n").nth(1).unwrap().split("\n\n").next().unwrap();
@@ -14,7 +14,7 @@ fn commands() -> Vec<String> {
     names.map(|line| line.split_whitespace().next().unwrap().to_owned()).filter(|name| name != "help").collect()
 }
 
-/// The names of a command and of the commands inside it.
+/// Returns the names of a command and its subcommands.
 fn commands_within(folder: &std::path::Path, name: &str) -> Vec<Vec<String>> {
     let help = done(folder, &[name, "--help"]).stdout;
     match help.split("Commands:\n").nth(1) {
@@ -93,12 +93,12 @@ fn a_closed_stdout_is_a_failure_and_not_a_crash() {
         .unwrap();
     drop(child.stdout.take());
     let output = child.wait_with_output().unwrap();
-    // The script may have fitted into the pipe before it was closed: then the run was fine.
+    // The script may have fitted into the pipe's buffer before the pipe was closed; then the run succeeded.
     assert!(matches!(output.status.code(), Some(0 | 1)), "{output:?}");
     assert!(!String::from_utf8_lossy(&output.stderr).contains("panicked"), "{output:?}");
 }
 
-/// A global option that a command takes changes what it does, or it is refused: `--seed` and `--report` mean nothing to some.
+/// A global option either has an effect on a command or is refused, such as `--seed` and `--report` by some.
 #[test]
 fn options_without_effect_are_refused() {
     let folder = tempfile::tempdir().unwrap();
@@ -131,7 +131,7 @@ fn options_without_effect_are_refused() {
 #[test]
 fn a_file_above_the_memory_limit_is_refused_with_a_sufficient_limit() {
     let folder = tempfile::tempdir().unwrap();
-    // 2 MB as a file, as much again as a picture.
+    // 2 MB as a file, and as much again decoded.
     let mut map = b"Pf\n800 700\n-1\n".to_vec();
     map.resize(map.len() + 4 * 800 * 700, 0x3f);
     std::fs::write(folder.path().join("a.pfm"), map).unwrap();

@@ -1,4 +1,4 @@
-//! How photographs are named: files, folders and patterns, in every command.
+//! Input photographs as files, folders and patterns, in every command.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -9,7 +9,7 @@ use support::{JOBS, done, fixture, run, strs};
 
 #[test]
 fn every_command_expands_folders_and_patterns() {
-    // Frames of a rig are named apart: `depth` takes two folders and gives a map of each pair.
+    // `depth` takes two folders of a rig's frames and writes a map of each pair.
     for job in JOBS.iter().filter(|job| job.name != "depth") {
         let (folder, inputs) = job.folder();
         done(folder.path(), &strs(&job.args(&inputs)));
@@ -81,7 +81,7 @@ fn every_command_names_its_output_by_the_same_option() {
         &["man"],
     ];
     for command in commands {
-        // An option that is not known is wrong usage, help or not.
+        // An unknown option is wrong usage, also with --help.
         let unknown = run(folder.path(), &[command, &["--outptu", "x", "--help"][..]].concat());
         assert_eq!(unknown.code, Some(2), "{command:?}: {unknown:?}");
         for option in ["-o", "--output"] {

@@ -1,4 +1,4 @@
-//! What commands write: whole or not at all, the same on any number of threads, and nothing besides.
+//! Outputs of commands: complete or not written at all, the same with any number of threads, and no other files.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -16,7 +16,7 @@ fn json_is_one_object_and_stdout_is_empty_without_it() {
         let seconds = value["seconds"].as_object().unwrap();
         let total = seconds["total"].as_f64().unwrap();
         let stages: f64 = seconds.iter().filter(|(name, _)| *name != "total").map(|(_, s)| s.as_f64().unwrap()).sum();
-        // Stages are parts of the whole; 1 % for the clock being read at slightly different moments.
+        // Stages are parts of the total; 1 % for the time between clock readings.
         assert!(stages <= 1.01 * total, "{}: {seconds:?}", job.name);
         let ran = done(folder.path(), &strs(&args));
         assert_eq!(ran.stdout, "", "{}", job.name);
@@ -97,7 +97,7 @@ fn an_unwritable_output_is_reported_before_the_computation() {
     }
 }
 
-/// The arguments of a job with its outputs in a folder `new/deep` that is not there.
+/// Returns the arguments of a job with its outputs in a folder `new/deep` that does not exist.
 fn in_new_folder(args: &[String], outputs: &[&str]) -> Vec<String> {
     let moved = |word: &String| match outputs.iter().any(|output| output.trim_end_matches('/') == word) {
         true => format!("new/deep/{word}"),
@@ -182,7 +182,7 @@ fn outputs_may_be_devices() {
         let args = job.args(&inputs).into_iter();
         let args: Vec<String> =
             args.map(|word| if outputs.contains(&&word[..]) { "/dev/null".to_owned() } else { word }).collect();
-        // Two outputs of one name are refused, whatever it is.
+        // Two outputs of one name are refused, also for devices.
         let code = if outputs[0] == outputs[1] { 0 } else { 2 };
         assert_eq!(run(folder.path(), &strs(&args)).code, Some(code), "{}", job.name);
     }
@@ -222,7 +222,7 @@ fn a_failed_run_keeps_the_outputs_of_the_previous_one() {
     }
 }
 
-/// Kills runs at moments spread over their whole duration.
+/// Kills runs at times spread over their whole duration.
 #[test]
 fn a_killed_run_leaves_no_incomplete_output() {
     const MOMENTS: u32 = 8;
@@ -239,14 +239,14 @@ fn a_killed_run_leaves_no_incomplete_output() {
             }
             let mut child = cv(folder.path()).args(&args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
             std::thread::sleep(whole * moment / (MOMENTS - 2));
-            // It may have ended by itself.
+            // The run may have ended before.
             let _ = child.kill();
             child.wait().unwrap();
             for (written, new) in job.written(folder.path()).iter().zip(&new) {
                 assert!(written == b"old" || written == new, "{} after {:?}", job.name, whole * moment / MOMENTS);
             }
         }
-        // A later run sweeps up what the killed ones may have left.
+        // A later run removes the temporary files of killed ones.
         done(folder.path(), &strs(&args));
         let left = fs::read_dir(folder.path()).unwrap().flatten();
         assert_eq!(left.filter(|e| e.file_name().to_string_lossy().starts_with(".cv-")).count(), 0, "{}", job.name);
@@ -266,7 +266,7 @@ fn the_report_is_a_single_file_without_external_references() {
         for outside in ["src=\"http", "href=\"http", "@import", "src=\"//"] {
             assert!(!html.contains(outside), "{}: {outside}", job.name);
         }
-        assert!(html.contains("data:image/") || html.contains("<svg"), "{}: no pictures", job.name);
+        assert!(html.contains("data:image/") || html.contains("<svg"), "{}: no images", job.name);
     }
 }
 
@@ -276,7 +276,7 @@ fn two_photographs_with_the_same_output_name_are_wrong_usage() {
     for name in ["a/same.png", "b/same.jpg"] {
         let path = folder.path().join(name);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
-        // Never read: the names are judged first.
+        // The file is never read: the names are checked first.
         fs::write(path, "").unwrap();
     }
     for command in [&["undistort", "--camera", "none.yaml"][..], &["segment", "predict", "--model", "none.json"]] {
