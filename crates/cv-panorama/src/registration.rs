@@ -54,7 +54,7 @@ pub enum RegistrationError {
     Count {
         /// Photographs registered.
         registered: usize,
-        /// Photographs given.
+        /// Number of photographs given.
         got: usize,
     },
     /// The size of a photograph differs.

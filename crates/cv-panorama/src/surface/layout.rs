@@ -422,7 +422,7 @@ mod tests {
     use super::*;
     use cv_core::{Camera, Named};
 
-    /// Photographs of 600 x 400 at focal length 500 (62 by 44 degrees), turned by these yaws and pitches.
+    /// Photographs of 600 × 400 px at focal length 500 px (62° by 44°), rotated by these yaws and pitches.
     fn alignment(turns: &[(f64, f64)]) -> Alignment {
         let views = turns
             .iter()
@@ -462,7 +462,7 @@ mod tests {
                 let l = layout(&set, projection, &Framing::default(), 1.0, MANY).unwrap();
                 assert_eq!(l.placements.len(), 2);
                 for p in &l.placements {
-                    // Every pixel of the photograph's border lies within its bounds.
+                    // Every border pixel of the photograph is inside its bounds.
                     for pixel in p.view.border(100) {
                         let q = l.surface.forward(&p.view.ray(pixel).unwrap()).unwrap() - p.origin;
                         assert!(
@@ -519,7 +519,7 @@ mod tests {
         assert!(layout(&straight_up, Projection::Auto, &Framing::default(), 1.0, MANY).is_ok());
     }
 
-    /// The set all around, in two rows, that shows everything but what lies more than 60° below or above the horizon.
+    /// A full circle of photographs in three rows, up to about 60° above and below the horizon.
     fn all_around() -> Alignment {
         let row = |pitch: f64| (0..10).map(move |k| (f64::from(k) * TAU / 10.0, pitch));
         alignment(&row(-0.6).chain(row(0.0)).chain(row(0.6)).collect::<Vec<_>>())
@@ -551,7 +551,7 @@ mod tests {
         assert!(ends.iter().any(|y| (y - 500.0 * PI).abs() < 1.0), "{ends:?}");
     }
 
-    /// The angle between what two pixels of a canvas show, in degrees.
+    /// Returns the angle between the directions of two canvas pixels, in degrees.
     fn angle(canvas: &Canvas, a: (f64, f64), b: (f64, f64)) -> f64 {
         let ray = |(x, y)| canvas.ray(Point2::new(x, y));
         ray(a).angle(&ray(b)).to_degrees()

@@ -41,7 +41,7 @@ impl Model for Mercator {
         true
     }
 
-    /// Never chosen by itself: a cylinder or a sphere is what viewers expect.
+    /// Never selected automatically: viewers expect a cylinder or a sphere.
     fn suits(&self, _: f64, _: f64) -> bool {
         false
     }

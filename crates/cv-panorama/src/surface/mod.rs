@@ -223,10 +223,10 @@ mod tests {
     fn the_declared_limits_of_surfaces_agree_with_their_formulas() {
         for (projection, model) in SURFACES {
             let surface = Surface { projection, scale: 100.0 };
-            // Behind the camera there is only what goes around, and the stereographic plane, which goes everywhere.
+            // Only periodic and stereographic surfaces contain directions behind the camera.
             let behind = surface.period().is_some() || projection == Projection::Stereographic;
             assert_eq!(surface.forward(&Vector3::new(0.0, 0.1, -1.0)).is_some(), behind);
-            // What is drawn at the most ends where the formulas have numbers, and beyond it nothing is said to be drawn.
+            // The formulas are finite up to the widest field; beyond it the surface reports no size.
             let [across, up] = projection.widest_field();
             assert!(surface.half_size(across, up).iter().all(Option::is_some), "{projection:?}");
             for beyond in [1.01, 3.0, f64::NAN, f64::INFINITY, -0.1, 0.0] {

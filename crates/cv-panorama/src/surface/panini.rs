@@ -12,7 +12,7 @@ pub(super) struct Panini;
 impl Model for Panini {
     fn forward(&self, ray: &Vector3<f64>, scale: f64) -> Option<Point2<f64>> {
         let h = ray.x.hypot(ray.z);
-        // The same two ways; each where nothing cancels.
+        // Two equal expressions; each is used where it has no cancellation.
         let sum = if ray.z >= 0.0 { h + ray.z } else { ray.x * ray.x / (h - ray.z) };
         let holds = h > 1e-6 * ray.norm() && sum > 1e-9 * h;
         holds.then(|| Point2::new(2.0 * scale * ray.x / sum, 2.0 * scale * ray.y / sum))
@@ -34,7 +34,7 @@ impl Model for Panini {
         false
     }
 
-    /// 120° to each side, where it enlarges heights by S = 4 and widths by 1/cos²(60°) = 4, and as high as 75° lie in the middle.
+    /// 120° to each side, where heights are magnified by S = 4 and widths by 1/cos²(60°) = 4, and up to 75° above and below the center.
     fn field(&self) -> [f64; 2] {
         [240_f64.to_radians(), 150_f64.to_radians()]
     }
@@ -43,7 +43,7 @@ impl Model for Panini {
         true
     }
 
-    /// Never chosen by itself: what runs across the view bends.
+    /// Never selected automatically: horizontal lines are curved.
     fn suits(&self, _: f64, _: f64) -> bool {
         false
     }

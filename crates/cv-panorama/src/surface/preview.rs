@@ -201,7 +201,7 @@ mod tests {
 
     #[test]
     fn the_preview_is_the_block_average_of_the_canvas() {
-        // A plane and a camera that looks straight at it: the canvas is the photograph.
+        // A plane and a camera perpendicular to it: the canvas equals the photograph.
         let photo = RgbU8::from_fn(64, 48, |x, y| [(x * 3) as u8, (y * 5) as u8, 100]);
         let surface = Surface { projection: Projection::Plane, scale: 80.0 };
         let bounds = Bounds { left: 0, top: 0, right: 64, bottom: 48 };
@@ -226,7 +226,7 @@ mod tests {
         for y in 0..12 {
             for x in 0..16 {
                 let [r, g, b] = preview.pieces[0].warped.color(x, y).unwrap();
-                // The mean of a ramp over a block is its value at the block's middle, rounded.
+                // The mean of a ramp over a block is its value at the block's center, rounded.
                 assert!((f64::from(r) - 3.0 * (4.0 * x as f64 + 1.5)).abs() <= 1.0, "{x} {y} {r}");
                 assert!((f64::from(g) - 5.0 * (4.0 * y as f64 + 1.5)).abs() <= 1.0);
                 assert_eq!(b, 100);
@@ -256,7 +256,7 @@ mod tests {
         assert_eq!(half.warped.color(3, 2), None);
         assert_eq!(half.warped.color(4, 2), Some([55, 50, 7]));
         assert_eq!(half.eccentricity, [1.0, 3.0, 5.0, 15.0, 17.0, 19.0]);
-        // Number 8 lies in the first block.
+        // Number 8 is in the first block.
         assert_eq!(half.clipped, [true, false, false, false, false, false]);
     }
 

@@ -11,7 +11,7 @@ pub(super) struct Stereographic;
 impl Model for Stereographic {
     fn forward(&self, ray: &Vector3<f64>, scale: f64) -> Option<Point2<f64>> {
         let n = ray.norm();
-        // The same two ways; each where nothing cancels.
+        // Two equal expressions; each is used where it has no cancellation.
         let sum = if ray.z >= 0.0 { n + ray.z } else { (ray.x * ray.x + ray.y * ray.y) / (n - ray.z) };
         (sum > 1e-12 * n).then(|| Point2::new(2.0 * scale * ray.x / sum, 2.0 * scale * ray.y / sum))
     }
@@ -32,7 +32,7 @@ impl Model for Stereographic {
         true
     }
 
-    /// 150° from the middle, where it enlarges by 1/cos²(75°) = 15; the point opposite to the middle lies at infinity.
+    /// 150° from the center, where lengths are magnified by 1/cos²(75°) = 15; the antipode of the center is at infinity.
     fn field(&self) -> [f64; 2] {
         [300_f64.to_radians(); 2]
     }
@@ -41,7 +41,7 @@ impl Model for Stereographic {
         true
     }
 
-    /// Never chosen by itself: it bends what people know to be straight.
+    /// Never selected automatically: straight lines are curved.
     fn suits(&self, _: f64, _: f64) -> bool {
         false
     }

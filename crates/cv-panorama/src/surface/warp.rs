@@ -383,8 +383,8 @@ mod tests {
                             assert_eq!(a, 255);
                             let q = q.unwrap();
                             for (got, want) in [r, g, b].into_iter().zip(wave(q.x, q.y)) {
-                                // Half a level of rounding in the photograph, half in the result, curvature 90·0.06²/8 = 0.04
-                                // (more for repeated pixels at the border: one slope of 5.4 levels times nothing, as inside).
+                                // Half a level of rounding in the photograph, half in the result, and an interpolation error
+                                // of 90·0.06²/8 = 0.04 from the curvature.
                                 assert!(
                                     (f64::from(got) - want).abs() < 1.6,
                                     "{projection:?} {distortion:?} {x} {y}: {got} {want}"
@@ -419,7 +419,7 @@ mod tests {
                     }
                 }
             }
-            // The sphere's pixels are as large as the photograph's at the middle, larger than those at its sides.
+            // The sphere's pixels are as large as the photograph's at the center, and larger at its sides.
             assert!((150..=230).contains(&reached), "{distortion:?} {reached}");
         }
     }
