@@ -1,4 +1,4 @@
-//! Time of a refusal: matches that determine no model, from the first look to the typed answer. Bar: 50 ms each.
+//! Time of the rejection of degenerate matches, until the typed error. Target: 50 ms each.
 //! `cargo bench --manifest-path benches/Cargo.toml --bench degenerate`.
 
 use criterion::{Criterion, criterion_group, criterion_main};
@@ -12,18 +12,18 @@ use std::hint::black_box;
 
 const MATCHES: usize = 300;
 
-/// Names and matches.
+/// Returns names and matches of the degenerate inputs.
 fn inputs() -> Vec<(&'static str, Vec<Correspondence>)> {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut random = |high: f64| high * f64::from(rng.next_u32()) / 4294967296.0;
-    let mut wrong = |n: usize, size: f64, from: f64| -> Vec<Correspondence> {
+    let mut random_matches = |n: usize, size: f64, from: f64| -> Vec<Correspondence> {
         let mut at = || from + random(size);
         (0..n).map(|_| Correspondence::new(at(), at(), at(), at())).collect()
     };
-    let random_ones = wrong(MATCHES, 900.0, 0.0);
-    let mut infinite = random_ones.clone();
+    let outliers = random_matches(MATCHES, 900.0, 0.0);
+    let mut infinite = outliers.clone();
     infinite[MATCHES - 1].b.y = f64::INFINITY;
-    let mut nan = random_ones.clone();
+    let mut nan = outliers.clone();
     nan[MATCHES - 1].a.x = f64::NAN;
     let line = |m: &Correspondence| Correspondence::new(m.a.x, 0.5 * m.a.x, m.b.x, 100.0 - 0.3 * m.b.x);
     let plane = |m: &Correspondence| {
@@ -31,16 +31,16 @@ fn inputs() -> Vec<(&'static str, Vec<Correspondence>)> {
         Correspondence::new(m.a.x, m.a.y, (0.9 * m.a.x + 30.0) / w, (m.a.y - 20.0) / w)
     };
     vec![
-        ("7 points", wrong(7, 900.0, 0.0)),
-        ("repeated points", (0..MATCHES).map(|i| random_ones[i % 3]).collect()),
-        ("collinear", random_ones.iter().map(line).collect()),
-        ("one plane", random_ones.iter().map(plane).collect()),
+        ("7 points", random_matches(7, 900.0, 0.0)),
+        ("repeated points", (0..MATCHES).map(|i| outliers[i % 3]).collect()),
+        ("collinear", outliers.iter().map(line).collect()),
+        ("one plane", outliers.iter().map(plane).collect()),
         ("NaN", nan),
         ("infinite", infinite),
-        ("up to 1e9 px", wrong(MATCHES, 2e9, -1e9)),
-        ("beyond 1e9 px", wrong(MATCHES, 900.0, 1e9)),
-        ("random", random_ones),
-        ("5000 random", wrong(5000, 900.0, 0.0)),
+        ("up to 1e9 px", random_matches(MATCHES, 2e9, -1e9)),
+        ("beyond 1e9 px", random_matches(MATCHES, 900.0, 1e9)),
+        ("random", outliers),
+        ("5000 random", random_matches(5000, 900.0, 0.0)),
     ]
 }
 

@@ -8,8 +8,8 @@ use cv_features::{
     harris, harris_response, match_byte_descriptors, match_descriptors, match_guided, mops, sift,
 };
 
-/// Squares of random gray at several sizes: corners and blobs at all scales.
-fn image() -> GrayF32 {
+/// Generates squares of random gray levels at several sizes: corners and blobs at all scales.
+fn generate_image() -> GrayF32 {
     let cell = |x: usize, y: usize, size: usize| {
         let mut v =
             ((x / size) as u32).wrapping_mul(0x9E37_79B9) ^ ((y / size + size) as u32).wrapping_mul(0x85EB_CA6B);
@@ -20,14 +20,14 @@ fn image() -> GrayF32 {
     GrayF32::from_fn(1333, 750, |x, y| [[3, 7, 13, 29, 61].map(|size| cell(x, y, size)).iter().sum::<f32>() / 5.0])
 }
 
-/// Numbers from 0 to 1, always the same.
+/// Returns uniform pseudorandom numbers in [0, 1).
 fn random(state: &mut u32) -> f32 {
     *state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
     (*state >> 8) as f32 / (1 << 24) as f32
 }
 
 fn detection(c: &mut Criterion) {
-    let image = image();
+    let image = generate_image();
     let options = HarrisOptions::default();
     c.bench_function("harris_response 1333x750", |b| b.iter(|| harris_response(image.view(), &options)));
     c.bench_function("harris 1333x750", |b| b.iter(|| harris(image.view(), &options, &Silent)));
@@ -37,19 +37,24 @@ fn detection(c: &mut Criterion) {
         .collect();
     c.bench_function("anms 20000 to 500", |b| b.iter(|| anms(&corners, 500, 0.9)));
     c.bench_function("anms_square_covering 20000 to 500", |b| b.iter(|| anms_square_covering(&corners, 500)));
-    let (settings, oriented) = (SiftOptions { max_features: 2000, ..SiftOptions::default() }, MopsOptions::default());
+    let (sift_options, mops_options) =
+        (SiftOptions { max_features: 2000, ..SiftOptions::default() }, MopsOptions::default());
     let board = GrayF32::from_fn(1333, 750, |x, y| {
-        // Ten by seven squares of 80 pixels, turned by 20°.
+        // Ten by seven squares of 80 pixels, rotated by 20°.
         let (u, v) = (x as f32 * 0.94 + y as f32 * 0.34 - 350.0, y as f32 * 0.94 - x as f32 * 0.34 + 150.0);
         let inside = (0.0..800.0).contains(&u) && (0.0..560.0).contains(&v);
         [if inside && ((u / 80.0) as u32 + (v / 80.0) as u32) % 2 == 0 { 0.1 } else { 0.8 }]
     });
-    let (size, seek) = (Some(BoardSize::new(9, 6)), ChessboardOptions::default());
-    assert!(find_chessboard(board.view(), size, &seek, &Silent).is_ok());
-    c.bench_function("chessboard 9x6 in 1333x750", |b| b.iter(|| find_chessboard(board.view(), size, &seek, &Silent)));
-    c.bench_function("no chessboard in 1333x750", |b| b.iter(|| find_chessboard(image.view(), size, &seek, &Silent)));
-    c.bench_function("sift 2000 of 1333x750", |b| b.iter(|| sift(image.view(), &settings, &Silent)));
-    c.bench_function("mops 2000 of 1333x750", |b| b.iter(|| mops(image.view(), &oriented, &Silent)));
+    let (size, board_options) = (Some(BoardSize::new(9, 6)), ChessboardOptions::default());
+    assert!(find_chessboard(board.view(), size, &board_options, &Silent).is_ok());
+    c.bench_function("chessboard 9x6 in 1333x750", |b| {
+        b.iter(|| find_chessboard(board.view(), size, &board_options, &Silent))
+    });
+    c.bench_function("no chessboard in 1333x750", |b| {
+        b.iter(|| find_chessboard(image.view(), size, &board_options, &Silent))
+    });
+    c.bench_function("sift 2000 of 1333x750", |b| b.iter(|| sift(image.view(), &sift_options, &Silent)));
+    c.bench_function("mops 2000 of 1333x750", |b| b.iter(|| mops(image.view(), &mops_options, &Silent)));
 }
 
 fn matching(c: &mut Criterion) {
@@ -59,14 +64,14 @@ fn matching(c: &mut Criterion) {
         let mut set = || (0..count * kind.dimension).map(|_| random(&mut state)).collect::<Vec<f32>>();
         let empty = || Descriptors::new(kind);
         let pair = [set(), set()].map(|data| Descriptors::from_vec(kind, data).unwrap_or_else(empty));
-        let name = format!("two nearest {count}x{count}x{}", kind.dimension);
+        let name = format!("two nearest neighbors {count}x{count}x{}", kind.dimension);
         c.bench_function(&name, |b| b.iter(|| match_descriptors(&pair[0], &pair[1], &options, &Silent)));
         if let [Some(x), Some(y)] = [0, 1].map(|i| ByteDescriptors::new(&pair[i])) {
             let name = format!("{name} of bytes");
             c.bench_function(&name, |b| b.iter(|| match_byte_descriptors(&x, &y, &options, &Silent)));
         }
     }
-    // Sideways motion: the lines are the rows.
+    // Sideways motion: the epipolar lines are the rows.
     let rows = TwoViewModel::Fundamental(Matrix3::new(0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0));
     let kind = DescriptorKind::ROOT_SIFT;
     let features = [0, 1].map(|_| {
@@ -77,9 +82,9 @@ fn matching(c: &mut Criterion) {
         }
         features
     });
-    let along = GuidedOptions::default();
+    let guided_options = GuidedOptions::default();
     c.bench_function("guided 12000x12000", |b| {
-        b.iter(|| match_guided(&features[0], &features[1], None, &rows, &along, &Silent));
+        b.iter(|| match_guided(&features[0], &features[1], None, &rows, &guided_options, &Silent));
     });
 }
 

@@ -1,1 +1,1 @@
-//! Nothing: the benchmarks are the files beside this one.
+//! Empty: the benchmarks are the other files of this folder.

@@ -10,7 +10,7 @@ use cv_geometry::{
 };
 use std::hint::black_box;
 
-/// Eight points that two cameras see, in normalized coordinates.
+/// Returns eight points and their projections in two cameras, in normalized coordinates.
 fn scene() -> (Vec<Point3<f64>>, Vec<Correspondence>) {
     let pose = Pose::new(Rotation3::new(Vector3::new(0.05, -0.1, 0.02)), Vector3::new(-0.9, 0.1, 0.3));
     let points: Vec<Point3<f64>> = (0..8)
@@ -19,8 +19,8 @@ fn scene() -> (Vec<Point3<f64>>, Vec<Correspondence>) {
             Point3::new((1.7 * t).sin() * 1.5, (2.9 * t).cos() * 1.2, 6.0 + (4.1 * t).sin() * 2.0)
         })
         .collect();
-    let seen = |p: &Point3<f64>| Point2::new(p.x / p.z, p.y / p.z);
-    let matches = points.iter().map(|p| Correspondence { a: seen(p), b: seen(&pose.transform(p)) }).collect();
+    let project = |p: &Point3<f64>| Point2::new(p.x / p.z, p.y / p.z);
+    let matches = points.iter().map(|p| Correspondence { a: project(p), b: project(&pose.transform(p)) }).collect();
     (points, matches)
 }
 
@@ -44,7 +44,7 @@ fn bench(c: &mut Criterion) {
         })
     });
     group.bench_function("fundamental, 8 points", |b| b.iter(|| fundamental_eight_point(black_box(&m)).unwrap()));
-    // Four points of one plane: of four in space, two views seldom agree on the orientation, and the solver ends early.
+    // Coplanar points: projections of four general points rarely have a consistent orientation, and the solver would return early.
     let a4 = [Point2::new(-0.3, -0.2), Point2::new(0.35, -0.25), Point2::new(0.3, 0.3), Point2::new(-0.25, 0.2)];
     let b4 = a4.map(|p| {
         Point2::new((1.1 * p.x + 0.1 * p.y + 0.05) / (1.0 + 0.1 * p.x), (0.9 * p.y - 0.1 * p.x) / (1.0 + 0.1 * p.x))

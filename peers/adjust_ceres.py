@@ -28,13 +28,13 @@ def solve(loss, solver):
     for image in model.images:
         config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    # Its construction is not counted, ours is.
+    # The time of its construction is excluded; ours includes it.
     adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
     start = time.perf_counter()
     report = adjuster.solve()
     seconds = time.perf_counter() - start
     summary = report.ceres_summary
-    # Ceres halves the sum of squares.
+    # Ceres' cost is half the sum of squares.
     return {"loss": loss, "solver": solver, "initial_cost": 2 * summary.initial_cost, "cost": 2 * summary.final_cost,
             "iterations": summary.num_successful_steps + summary.num_unsuccessful_steps,
             "seconds": min(seconds, summary.total_time_in_seconds)}

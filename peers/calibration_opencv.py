@@ -1,11 +1,11 @@
-"""OpenCV's calibration, on one thread where not said otherwise; JSON lines. usage:
-calibration_opencv.py pairs FOLDER           both finders on leftNN.jpg, rightNN.jpg of 9x6 corners: finding, errors, the rig
-calibration_opencv.py wide FOLDER [OUT]      both finders on photographs of 8x6 corners, with 5 and with 8 numbers; classic corners to OUT as a vnlog
-calibration_opencv.py mrcal FOLDER VNLOG     mrcal, where it is installed, on those corners; its hold-out with solvePnP's poses
-calibration_opencv.py corners FOLDER         both finders on the PNG files, 9x6 corners (only the classic one on names that begin with none)
-calibration_opencv.py markers FOLDER KIND C R DICTIONARY LAST  the board of markers in the PNG files; LAST: share of a charuco's marker, else cells of the frame
+"""OpenCV's calibration, on one thread unless noted; prints JSON lines. usage:
+calibration_opencv.py pairs FOLDER           both detectors on leftNN.jpg, rightNN.jpg with 9x6 corners: detections, errors, the rig
+calibration_opencv.py wide FOLDER [OUT]      both detectors on photographs with 8x6 corners, with 5 and 8 distortion coefficients; the classic corners are written to OUT as a vnlog
+calibration_opencv.py mrcal FOLDER VNLOG     mrcal, if installed, on those corners; hold-out with poses by solvePnP
+calibration_opencv.py corners FOLDER         both detectors on the PNG files, 9x6 corners (only the classic one on names with the prefix none)
+calibration_opencv.py markers FOLDER KIND C R DICTIONARY LAST  the marker board in the PNG files; LAST: marker to square ratio of a charuco, else border cells
 calibration_opencv.py solve FILE C R W H     calibrateCamera of views of C x R corners, a line of x and y each
-calibration_opencv.py remap W H OUT          a pair undistorted by fixed-point maps, times on one thread and on two; the inputs and results to OUT
+calibration_opencv.py remap W H OUT          a pair undistorted with fixed-point maps, on one and two threads; inputs and results are in OUT
 """
 import ast, glob, json, os, re, shutil, subprocess, sys, tempfile, time
 import cv2
@@ -26,16 +26,16 @@ def sector(gray, size):
     return corners if found else None
 
 
-FINDERS = {"classic": classic, "sector-based": sector}
+DETECTORS = {"classic": classic, "sector-based": sector}
 
 
-def look(paths, size, finder):
-    """Corners or None of each photograph, and processor seconds of finding alone."""
+def detect_all(paths, size, detector):
+    """Returns corners or None for each photograph, the processor seconds of detection without reading, and the image size."""
     out, seconds = [], 0.0
     for path in paths:
         gray = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
         start = time.thread_time()
-        out.append(FINDERS[finder](gray, size))
+        out.append(DETECTORS[detector](gray, size))
         seconds += time.thread_time() - start
     return out, seconds, gray.shape[::-1]
 
@@ -47,7 +47,8 @@ def board(size):
 
 
 def holdout(points, views, solve):
-    """The other views by their poses alone, for either half; root mean square distance. `solve` makes matrix and distortion of a half."""
+    """Returns the hold-out RMS in pixels: intrinsics from one half of the views, poses of the other half by PnP, for both halves. `solve`
+    returns matrix and distortion from a half."""
     squares, count = 0.0, 0
     for half in (0, 1):
         k, d = solve(half)
@@ -72,9 +73,9 @@ def pairs(folder):
     points = board(size)
     lefts = sorted(glob.glob(f"{folder}/left*.jpg"))
     rights = [os.path.join(folder, os.path.basename(p).replace("left", "right")) for p in lefts]
-    for finder in FINDERS:
-        a, s0, shape = look(lefts, size, finder)
-        b, s1, _ = look(rights, size, finder)
+    for detector in DETECTORS:
+        a, s0, shape = detect_all(lefts, size, detector)
+        b, s1, _ = detect_all(rights, size, detector)
         both = [i for i in range(len(a)) if a[i] is not None and b[i] is not None]
         a, b = [a[i] for i in both], [b[i] for i in both]
         many = [points] * len(both)
@@ -84,7 +85,7 @@ def pairs(folder):
         r1, r2, p1, p2, *_ = cv2.stereoRectify(k1, d1, k2, d2, shape, r, t, alpha=0)
         rows = lambda c, k, d, r, p: cv2.undistortPoints(c, k, d, R=r, P=p)[:, 0, 1]
         dy = np.concatenate([np.abs(rows(l, k1, d1, r1, p1) - rows(r_, k2, d2, r2, p2)) for l, r_ in zip(a, b)])
-        print(json.dumps({"finder": finder, "found": len(both), "of": len(lefts), "seconds": s0 + s1, "rms": [e1, e2], "stereo": e,
+        print(json.dumps({"detector": detector, "found": len(both), "of": len(lefts), "seconds": s0 + s1, "rms": [e1, e2], "stereo": e,
                           "holdout": [holdout(points, c, opencv(points, c, shape, 0)) for c in (a, b)],
                           "baseline": float(np.linalg.norm(t)), "dy": [float(dy.mean()), float(dy.max())], "version": VERSION}), flush=True)
 
@@ -93,19 +94,19 @@ def wide(folder, out=None):
     size = (8, 6)
     points = board(size)
     paths = sorted(glob.glob(f"{folder}/*.jpg"))
-    for finder in FINDERS:
-        all_corners, seconds, shape = look(paths, size, finder)
+    for detector in DETECTORS:
+        all_corners, seconds, shape = detect_all(paths, size, detector)
         views = [c for c in all_corners if c is not None]
-        if out and finder == "classic":
+        if out and detector == "classic":
             with open(out, "w") as file:
                 file.write("# filename x y level\n")
                 for path, corners in zip(paths, all_corners):
                     rows = [] if corners is None else corners.reshape(-1, 2).tolist()
                     file.writelines(f"{os.path.basename(path)} {x!r} {y!r} 0\n" for x, y in rows)
                     file.write("" if rows else f"{os.path.basename(path)} - - -\n")
-        for numbers, flags in ((5, 0), (8, cv2.CALIB_RATIONAL_MODEL)):
+        for coefficients, flags in ((5, 0), (8, cv2.CALIB_RATIONAL_MODEL)):
             rms = cv2.calibrateCamera([points] * len(views), views, shape, None, None, flags=flags)[0]
-            print(json.dumps({"finder": finder, "found": len(views), "of": len(paths), "seconds": seconds, "numbers": numbers, "rms": rms,
+            print(json.dumps({"detector": detector, "found": len(views), "of": len(paths), "seconds": seconds, "coefficients": coefficients, "rms": rms,
                               "holdout": holdout(points, views, opencv(points, views, shape, flags)), "version": VERSION}), flush=True)
 
 
@@ -133,28 +134,28 @@ def mrcal(folder, vnlog):
                                   text=True, cwd=folder, check=True).stdout
             values = re.search(r"'intrinsics': (\[.*?\])", open(f"{out}/camera-0.cameramodel").read()).group(1)
         fx, fy, cx, cy, *d = ast.literal_eval(values)
-        # Per measurement, a coordinate that is; the printed one is rounded.
+        # RMS per coordinate.
         rms = float(re.findall(r"## RMS error: ([0-9.]+)", text)[-1])
         return rms, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array(d), int(re.search(r"Noutliers: (\d+)", text).group(1))
 
-    for model, numbers in (("LENSMODEL_OPENCV5", 5), ("LENSMODEL_OPENCV8", 8)):
+    for model, coefficients in (("LENSMODEL_OPENCV5", 5), ("LENSMODEL_OPENCV8", 8)):
         rms, _, _, outliers = solve(names, model)
-        held = holdout(points, views, lambda half: solve(names[half::2], model)[1:3])
-        print(json.dumps({"finder": "mrcal", "found": len(names), "of": len(rows), "seconds": 0.0, "numbers": numbers, "rms": rms,
-                          "outliers": outliers, "holdout": held, "version": "mrcal"}), flush=True)
+        holdout_rms = holdout(points, views, lambda half: solve(names[half::2], model)[1:3])
+        print(json.dumps({"detector": "mrcal", "found": len(names), "of": len(rows), "seconds": 0.0, "coefficients": coefficients, "rms": rms,
+                          "outliers": outliers, "holdout": holdout_rms, "version": "mrcal"}), flush=True)
 
 
 def corners(folder):
     for path in sorted(glob.glob(f"{folder}/*.png")):
         gray = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
-        for finder, call in FINDERS.items():
-            if finder != "classic" and os.path.basename(path).startswith("none"):
+        for detector, call in DETECTORS.items():
+            if detector != "classic" and os.path.basename(path).startswith("none"):
                 continue
             start = time.thread_time()
             found = call(gray, (9, 6))
             seconds = time.thread_time() - start
             found = None if found is None else found.reshape(-1, 2).tolist()
-            print(json.dumps({"image": os.path.basename(path), "finder": finder, "seconds": seconds, "corners": found}), flush=True)
+            print(json.dumps({"image": os.path.basename(path), "detector": detector, "seconds": seconds, "corners": found}), flush=True)
 
 
 def markers(folder, kind, columns, rows, name, last):
@@ -168,7 +169,7 @@ def markers(folder, kind, columns, rows, name, last):
     else:
         parameters.markerBorderBits = int(last)
         grid = cv2.aruco.ArucoDetector(dictionary, parameters)
-        # Markers of the dictionary that are not on the board are none.
+        # Markers of the dictionary that are not on the board are ignored.
         detect = lambda gray: [c for c, i in zip(*grid.detectMarkers(gray)[:2]) if i < columns * rows]
     for path in sorted(glob.glob(f"{folder}/*.png")):
         gray = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
@@ -196,9 +197,9 @@ def remap(width, height, out):
     scale = width / 1280
     k = np.array([[900 * scale, 0, 650 * scale], [0, 902 * scale, 390 * scale], [0, 0, 1]])
     d = np.array([-0.3, 0.1, 1e-3, -5e-4, 0.0])
-    turn = cv2.Rodrigues(np.array([0.01, 0.02, 0.005]))[0]
-    # Of each camera its own, as a rig has.
-    maps = [cv2.initUndistortRectifyMap(k, d, turn, k, (width, height), cv2.CV_16SC2) for _ in range(2)]
+    rotation = cv2.Rodrigues(np.array([0.01, 0.02, 0.005]))[0]
+    # Separate maps for the two cameras, as in a rig.
+    maps = [cv2.initUndistortRectifyMap(k, d, rotation, k, (width, height), cv2.CV_16SC2) for _ in range(2)]
     for channels, name in ((1, "gray"), (3, "rgb")):
         shape = (height, width) if channels == 1 else (height, width, 3)
         pair = [np.fromfile(f"{out}/{name}{i}.bytes", np.uint8).reshape(shape) for i in (0, 1)]
@@ -208,8 +209,8 @@ def remap(width, height, out):
             best = float("inf")
             for _ in range(100):
                 start = time.perf_counter()
-                for image, result, both in zip(pair, results, maps):
-                    cv2.remap(image, *both, cv2.INTER_LINEAR, dst=result)
+                for image, result, map_pair in zip(pair, results, maps):
+                    cv2.remap(image, *map_pair, cv2.INTER_LINEAR, dst=result)
                 best = min(best, time.perf_counter() - start)
             print(json.dumps({"kind": name, "threads": threads, "seconds": best, "version": VERSION}), flush=True)
         results[0].tofile(f"{out}/{name}.result")

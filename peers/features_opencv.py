@@ -1,7 +1,7 @@
 """OpenCV's features. usage: features_opencv.py speed IMAGE WHAT | features_opencv.py extract N IMAGE...
 
-speed prints a JSON line per stage, the fastest of some warm runs with two threads. extract writes IMAGE.sift.npy and IMAGE.orb.npy: a row per
-feature, strongest first, of x, y, scale in pixels (half the keypoint's size), angle in radians, response, and the descriptor."""
+speed prints a JSON line with the fastest of some warm runs on two threads. extract writes IMAGE.sift.npy and IMAGE.orb.npy: a row per
+feature, by decreasing response, of x, y, scale in pixels (half the keypoint's size), angle in radians, response, and the descriptor."""
 import json, os, sys, time
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ def fastest(call, repeats):
 def speed(path, what):
     gray = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
     random = np.random.default_rng(1)
-    # Only what the stage needs: large arrays that lie around slow down how OpenCV gets its buffers.
+    # Only the arrays of this stage: other large arrays slow down OpenCV's allocations.
     sizes = [(n, d) for n, d in ((2000, 64), (8192, 128), (20000, 128)) if what.endswith(f" {n}")]
     sets = {n: [random.random((n, d), np.float32) for _ in range(2)] for n, d in sizes}
     square = random.random((4096, 4096), np.float32) if "product" in what else None

@@ -68,18 +68,18 @@ for kind, folder, methods, error in (("H", sys.argv[1], H, error_h), ("F", sys.a
         x, y, checked = load(path)
         a, b = np.ascontiguousarray(x[~checked]), np.ascontiguousarray(y[~checked])
         for name, method in methods.items():
-            times, off = [], float("inf")
+            times, residual = [], float("inf")
             for _ in range(REPEATS):
                 start = time.perf_counter()
                 try:
                     model = method(a, b)
-                except Exception:  # a peer that gives up has failed on this pair
+                except Exception:  # an exception counts as a failure on this pair
                     model = None
                 times.append(time.perf_counter() - start)
             if model is not None and np.asarray(model).shape == (3, 3):
-                off = float(error(np.asarray(model), x[checked], y[checked]))
+                residual = float(error(np.asarray(model), x[checked], y[checked]))
             print(json.dumps({"kind": kind, "pair": os.path.basename(path)[:-8], "method": name,
-                              "error": off if np.isfinite(off) else 1e9, "seconds": float(np.median(times))}), flush=True)
+                              "error": residual if np.isfinite(residual) else 1e9, "seconds": float(np.median(times))}), flush=True)
 
 # Each problem: kind, matches, rotation (9), translation (3), then x1 y1 x2 y2 in pixels, all f64.
 data = open(sys.argv[3], "rb").read()
@@ -96,6 +96,6 @@ while at < len(data):
     seconds = time.perf_counter() - start
     cosine = (np.trace(pose.R.T @ truth[:9].reshape(3, 3)) - 1) / 2
     t = pose.t / max(np.linalg.norm(pose.t), 1e-12)
-    off = max(np.degrees(np.arccos(np.clip(cosine, -1, 1))), np.degrees(np.arccos(np.clip(t @ truth[9:], -1, 1))))
-    print(json.dumps({"kind": str(kind), "pair": "", "method": "PoseLib", "error": float(off) if np.isfinite(off) else 180.0,
+    pose_error = max(np.degrees(np.arccos(np.clip(cosine, -1, 1))), np.degrees(np.arccos(np.clip(t @ truth[9:], -1, 1))))
+    print(json.dumps({"kind": str(kind), "pair": "", "method": "PoseLib", "error": float(pose_error) if np.isfinite(pose_error) else 180.0,
                       "seconds": seconds}), flush=True)

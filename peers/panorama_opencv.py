@@ -1,6 +1,6 @@
-"""OpenCV's Stitcher: photographs to one picture; one JSON line. usage: panorama_opencv.py panorama|scans THREADS OUT IMAGES…
+"""OpenCV's Stitcher: photographs to a panorama; prints one JSON line. usage: panorama_opencv.py panorama|scans THREADS OUT IMAGES…
 
-`cpu` counts from the first photograph read to the picture written, without the start of Python."""
+`cpu` is the processor time from reading the first photograph to writing the panorama, without the startup of Python."""
 import json, resource, sys, time
 import cv2
 

@@ -5,8 +5,8 @@ import numpy as np
 from stereo_scenes import SCENES, errors, truth_and_mask
 
 FOLDER = sys.argv[1]
-# Repeated for so many seconds, and so often at the least, for the fastest run; as ours are.
-SECONDS, LEAST_REPEATS = 0.5, 4
+# Seconds for which a matcher is repeated to find its fastest run, and the minimum number of repeats; the same as for ours.
+SECONDS, MIN_REPEATS = 0.5, 4
 cv2.setNumThreads(2)
 
 MODES = {
@@ -16,12 +16,12 @@ MODES = {
 
 
 def peak():
-    # Not ru_maxrss, which starts at what the program that started this one holds.
+    # Not ru_maxrss, whose initial value is that of the parent process.
     with open("/proc/self/status") as status:
         return 1024 * next(int(line.split()[1]) for line in status if line.startswith("VmHWM"))
 
 
-# The memory of HH at the largest size, before anything else has raised the peak.
+# Only the memory of HH at the largest size, since other runs would raise the peak.
 only_memory = len(sys.argv) > 2
 scenes = SCENES[-1:] if only_memory else SCENES
 for scene, left_name, right_name, disparities in scenes:
@@ -41,7 +41,7 @@ for scene, left_name, right_name, disparities in scenes:
             a, b = left, right
         times = []
         begin = time.perf_counter()
-        while len(times) < LEAST_REPEATS or time.perf_counter() - begin < SECONDS:
+        while len(times) < MIN_REPEATS or time.perf_counter() - begin < SECONDS:
             start = time.perf_counter()
             result = matcher.compute(a, b)
             times.append(time.perf_counter() - start)

@@ -6,7 +6,7 @@ import pandora
 import rasterio
 from stereo_scenes import SCENES, errors, truth_and_mask
 
-# Pandora's plug-ins read the arguments.
+# Pandora's plug-ins parse the arguments, so they are cleared.
 arguments, sys.argv = sys.argv, sys.argv[:1] + ["."]
 work = tempfile.mkdtemp()
 os.makedirs(work + "/out")
@@ -21,7 +21,7 @@ def read(path):
 
 
 def disparity(left, right, disparities, first=0):
-    """Disparities of a pair, NaN where there is none, and the seconds of the whole run."""
+    """Returns the disparities of a pair, NaN if invalid, and the seconds of the whole run."""
     for side, path in (("L", left), ("R", right)):
         gray = read(path).astype("uint8")
         with rasterio.open(f"{work}/{side}.tif", "w", driver="GTiff", height=gray.shape[0], width=gray.shape[1], count=1,
@@ -51,9 +51,9 @@ def disparity(left, right, disparities, first=0):
 if __name__ == "__main__":
     folder = arguments[1]
     for scene, left, right, disparities in SCENES:
-        found, seconds = disparity(f"{folder}/{scene}/{left}", f"{folder}/{scene}/{right}", disparities)
+        result, seconds = disparity(f"{folder}/{scene}/{left}", f"{folder}/{scene}/{right}", disparities)
         truth, mask = truth_and_mask(folder, scene, read)
         print(json.dumps({
-            "scene": scene, "mode": "Pandora", "seconds": seconds, **errors(found, truth, mask),
+            "scene": scene, "mode": "Pandora", "seconds": seconds, **errors(result, truth, mask),
             "version": getattr(pandora, "__version__", ""),
         }), flush=True)

@@ -1,4 +1,4 @@
-"""The Middlebury pairs that stereo matchers are held against, which pixels count, and the errors there."""
+"""The Middlebury pairs of the stereo benchmark, the mask of their evaluated pixels, and the error metrics."""
 import numpy as np
 
 # Name, left and right photograph, disparities.
@@ -8,13 +8,13 @@ SCENES = [
     ("cloth3", "view1.png", "view5.png", 128),
     ("motorcycle", "motorcycle_left.png", "motorcycle_right.png", 128),
 ]
-# Left and right truth of a scene, and disparity times what is written there; 0 is unknown.
+# Files of the left and right ground truth of a scene, and the scale of their disparities; 0 is unknown.
 TRUTHS = {"cones": (["disp2.png", "disp6.png"], 4), "teddy": (["disp2.png"], 4), "cloth3": (["disp1.png", "disp5.png"], 2)}
 
 
 def truth_and_mask(folder, scene, read):
-    """True disparities, and the pixels that count: those that both photographs see where a right truth tells, else all
-    with truth. `read` reads a gray image."""
+    """Returns the true disparities and the mask of the evaluated pixels: those visible in both views if the right view has ground
+    truth, else all with ground truth. `read` reads a gray image."""
     if scene == "motorcycle":
         left = np.load(f"{folder}/motorcycle/motorcycle_disp.npz")["arr_0"]
         return left, np.isfinite(left)
@@ -28,13 +28,13 @@ def truth_and_mask(folder, scene, read):
     ys, xs = np.mgrid[0:h, 0:w]
     xr = np.round(xs - np.nan_to_num(left)).astype(int)
     ok = mask & (xr >= 0)
-    seen = np.full_like(left, np.nan)
-    seen[ok] = right[0][ys[ok], xr[ok]]
-    return left, ok & (np.abs(seen - left) <= 1)
+    right_at_match = np.full_like(left, np.nan)
+    right_at_match[ok] = right[0][ys[ok], xr[ok]]
+    return left, ok & (np.abs(right_at_match - left) <= 1)
 
 
 def errors(disparity, truth, mask):
-    """Shares of the pixels of `mask`; a missing disparity is NaN and counts as wrong."""
+    """Returns density and bad pixel fractions over `mask`; a missing disparity is NaN and counts as bad."""
     n, error, valid = mask.sum(), np.abs(disparity - truth), np.isfinite(disparity)
     return {
         "density": float((mask & valid).sum() / n),

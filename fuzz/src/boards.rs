@@ -1,4 +1,4 @@
-//! Calibration boards in small pictures: printed as they are, seen from anywhere, damaged.
+//! Fuzzes the detectors of calibration boards with small images: any board, any viewpoint, damaged.
 
 use crate::structured as make;
 use arbitrary::Unstructured;
@@ -9,7 +9,7 @@ use cv_pipeline::calibration::{
 };
 use libfuzzer_sys::Corpus;
 
-/// Any board: its finder gives points of it, each once, in the picture.
+/// Asserts that detected points have unique, valid ids and are inside the image.
 pub fn board(bytes: &[u8]) -> Corpus {
     let u = &mut Unstructured::new(bytes);
     let shape = (make::whole(u, 2, 6), make::whole(u, 2, 5));
@@ -17,7 +17,9 @@ pub fn board(bytes: &[u8]) -> Corpus {
     let dictionary = dictionary[make::whole(u, 0, dictionary.len() - 1)];
     let board = match make::whole(u, 0, 3) {
         0 => Board::Chessboard { size: BoardSize::new(shape.0, shape.1), square: 1.0 },
-        1 => Board::Charuco(CharucoBoard { squares: shape, square: 1.0, marker: make::within(u, 0.2, 1.0), dictionary }),
+        1 => {
+            Board::Charuco(CharucoBoard { squares: shape, square: 1.0, marker: make::within(u, 0.2, 1.0), dictionary })
+        }
         kind => Board::MarkerGrid(MarkerGrid {
             markers: shape,
             marker: 1.0,
@@ -30,13 +32,13 @@ pub fn board(bytes: &[u8]) -> Corpus {
         return Corpus::Keep;
     }
     let (w, h) = (make::whole(u, 0, 160), make::whole(u, 0, 120));
-    let image = seen(u, &board, (w, h));
-    if let Ok(found) = find_board(image.view(), &board, &ChessboardOptions::default(), &Silent) {
-        let mut ids: Vec<usize> = found.iter().map(|point| point.id).collect();
+    let image = render_board(u, &board, (w, h));
+    if let Ok(points) = find_board(image.view(), &board, &ChessboardOptions::default(), &Silent) {
+        let mut ids: Vec<usize> = points.iter().map(|point| point.id).collect();
         ids.sort_unstable();
         ids.dedup();
-        assert!(ids.len() == found.len() && ids.last().is_none_or(|last| *last < board.points().len()));
-        for point in found {
+        assert!(ids.len() == points.len() && ids.last().is_none_or(|last| *last < board.points().len()));
+        for point in points {
             let inside = |v: f64, n: usize| (-1.0..=n as f64).contains(&v);
             assert!(inside(point.position.x, w) && inside(point.position.y, h), "{point:?}");
             assert!(point.deviation.is_finite() && point.deviation >= 0.0, "{point:?}");
@@ -45,8 +47,8 @@ pub fn board(bytes: &[u8]) -> Corpus {
     Corpus::Keep
 }
 
-/// The board turned, tilted and in some light, with rectangles of any gray over it.
-fn seen(u: &mut Unstructured<'_>, board: &Board, (w, h): (usize, usize)) -> GrayF32 {
+/// Renders the board under a rotation, tilt and illumination, partly covered by rectangles of any gray level.
+fn render_board(u: &mut Unstructured<'_>, board: &Board, (w, h): (usize, usize)) -> GrayF32 {
     let (black, o) = (board.black_rectangles(), board.outline());
     let (sin, cos) = make::within(u, -3.2, 3.2).sin_cos();
     let size = make::within(u, 0.4, 1.3) * (w as f64 / o.width).min(h as f64 / o.height);
@@ -62,8 +64,8 @@ fn seen(u: &mut Unstructured<'_>, board: &Board, (w, h): (usize, usize)) -> Gray
     });
     for _ in 0..make::whole(u, 0, 6) {
         let [x, y, wide, high, gray]: [u8; 5] = u.arbitrary().unwrap_or_default();
-        let strange = gray == 255;
-        let gray = if strange { make::number(u) as f32 } else { f32::from(gray) / 255.0 };
+        let is_extreme = gray == 255;
+        let gray = if is_extreme { make::number(u) as f32 } else { f32::from(gray) / 255.0 };
         for y in (usize::from(y)..h).take(1 + usize::from(high) / 8) {
             for x in (usize::from(x)..w).take(1 + usize::from(wide) / 8) {
                 image.set(x, y, [gray]);

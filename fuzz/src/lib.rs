@@ -1,7 +1,7 @@
-//! What the fuzz targets do with their input; `fuzz_targets/` only names them, one file each.
+//! Bodies of the fuzz targets; `fuzz_targets/` has one file for each with its entry point.
 //!
-//! A target fails by a panic, by more than 10 s or 2 GiB, or by an answer that cannot be: what has been written is read back as
-//! something else, a count is off.
+//! A target fails by a panic, by more than 10 s or 2 GiB, or by a violated invariant: a round trip changes the data, or a count is
+//! inconsistent.
 
 #[cfg(feature = "pipelines")]
 pub mod boards;
@@ -17,12 +17,12 @@ mod structured;
 
 use libfuzzer_sys::Corpus;
 
-/// Before the first input. Work stays on this thread: coverage is counted per input, and finds repeat.
+/// Initializes a target before its first input. All work runs on this thread, so that coverage is counted per input and failures are reproducible.
 pub fn start() {
-    // Fails where it has been done before, which does no harm.
+    // An error means that the pool exists already.
     let _ = rayon::ThreadPoolBuilder::new().num_threads(1).use_current_thread().build_global();
-    // libFuzzer's own hook ends the process at every panic, also at those that `cv_io::decode_image` makes an error of: decoders are other
-    // people's code. A panic that nobody catches still ends it.
+    // libFuzzer's own hook ends the process at every panic, also at those of third-party decoders that `cv_io::decode_image` catches and
+    // returns as errors. An uncaught panic still ends the process.
     std::panic::set_hook(Box::new(|info| {
         if std::env::var_os("CV_FUZZ_SHOW_PANICS").is_some() {
             eprintln!("{info}");
@@ -30,7 +30,7 @@ pub fn start() {
     }));
 }
 
-/// Inputs of another format are not worth a place in the corpus.
-fn only_if(kept: bool) -> Corpus {
-    if kept { Corpus::Keep } else { Corpus::Reject }
+/// Rejects inputs of another format from the corpus.
+fn keep_if(keep: bool) -> Corpus {
+    if keep { Corpus::Keep } else { Corpus::Reject }
 }

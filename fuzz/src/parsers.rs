@@ -1,16 +1,16 @@
-//! Bytes or text, as a file would hold them, to the readers of `cv-io`.
+//! Fuzzes the readers of `cv-io` with the bytes or text of a file.
 
-use crate::only_if;
+use crate::keep_if;
 use arbitrary::Arbitrary;
 use cv_core::{PointCloud, RgbU8};
 use cv_io::{CalibrationFormat, DynImage, Pixels, ReadOptions, npy, npz, pfm, ply};
 use libfuzzer_sys::Corpus;
 
-/// Small enough that thousands of pictures a second are decoded.
+/// Limits that allow thousands of images per second.
 const OPTIONS: ReadOptions = ReadOptions { max_pixels: 1 << 18, max_memory: 32 << 20 };
 
-/// A picture of the format that has this name.
-pub fn picture(format: &str, bytes: &[u8]) -> Corpus {
+/// Fuzzes the decoder of an image format.
+pub fn image(format: &str, bytes: &[u8]) -> Corpus {
     let magic = match format {
         "png" => bytes.starts_with(b"\x89PNG\r\n\x1a\n"),
         "jpeg" => bytes.starts_with(b"\xff\xd8\xff"),
@@ -23,21 +23,21 @@ pub fn picture(format: &str, bytes: &[u8]) -> Corpus {
         _ => true,
     };
     if magic && let Ok(image) = cv_io::decode_image(bytes, &OPTIONS) {
-        check(&image);
-        write_and_read(image);
+        check_image(&image);
+        assert_round_trip(image);
     }
-    only_if(magic)
+    keep_if(magic)
 }
 
-fn check(image: &DynImage) {
+fn check_image(image: &DynImage) {
     let (w, h) = image.size();
     assert!(w > 0 && h > 0 && (w * h) as u64 <= OPTIONS.max_pixels, "{w}×{h}");
     let focal = image.exif.focal.map(|focal| focal.pixels);
     assert!(focal.is_none_or(|px| px.is_finite() && px > 0.0), "{focal:?}");
 }
 
-/// What is read can be written, and is read back alike.
-fn write_and_read(image: DynImage) {
+/// Asserts that a decoded image survives encoding to PNG.
+fn assert_round_trip(image: DynImage) {
     let (w, h) = image.size();
     if w * h <= 1 << 10 {
         let written = match &image.pixels {
@@ -45,19 +45,20 @@ fn write_and_read(image: DynImage) {
             Pixels::Rgb16(deep) => cv_io::encode_png(deep.view()),
             _ => cv_io::encode_png(image.clone().into_rgb8().view()),
         };
-        let again = cv_io::decode_image(&written.expect("it can be written"), &OPTIONS).expect("it can be read");
-        assert!(again.into_rgb8() == image.clone().into_rgb8(), "another picture");
+        let again = cv_io::decode_image(&written.expect("a decoded image can be encoded"), &OPTIONS)
+            .expect("an encoded image can be decoded");
+        assert!(again.into_rgb8() == image.clone().into_rgb8(), "the round trip changed the image");
     }
     assert!(image.into_gray8().size() == (w, h));
 }
 
-/// A block of EXIF, in a JPEG and in a PNG.
+/// Fuzzes an EXIF block in a JPEG and in a PNG.
 pub fn exif(block: &[u8]) -> Corpus {
     if block.len() > 60_000 {
         return Corpus::Reject;
     }
     let image = RgbU8::new(8, 6, [90, 120, 30]);
-    let jpeg = cv_io::encode_jpeg(image.view(), 80).expect("a small picture");
+    let jpeg = cv_io::encode_jpeg(image.view(), 80).expect("a small image");
     let length = (block.len() + 8) as u16;
     let segment = [&[0xff, 0xe1], &length.to_be_bytes()[..], b"Exif\0\0", block].concat();
     let mut info = png::Info::with_size(8, 6);
@@ -69,13 +70,13 @@ pub fn exif(block: &[u8]) -> Corpus {
     writer.write_image_data(image.as_slice()).expect("in memory");
     writer.finish().expect("in memory");
     for bytes in [[&jpeg[..2], &segment, &jpeg[2..]].concat(), png] {
-        // A camera may say what it likes: the pixels are there.
-        check(&cv_io::decode_image(&bytes, &OPTIONS).expect("a whole picture"));
+        // Invalid metadata must not prevent the decoding of the pixels.
+        check_image(&cv_io::decode_image(&bytes, &OPTIONS).expect("a valid image"));
     }
     Corpus::Keep
 }
 
-/// A map of floats, whatever its format, with and without a scale.
+/// Fuzzes the reader of float maps in any format, with and without a scale.
 pub fn map(bytes: &[u8]) -> Corpus {
     for scale in [None, Some(4.0)] {
         if let Ok(map) = cv_io::decode_map(bytes, scale) {
@@ -89,20 +90,20 @@ pub fn pfm_map(bytes: &[u8]) -> Corpus {
     if let Ok(pfm::Pfm::Gray(map)) = pfm::decode_with(bytes, &OPTIONS) {
         let mut again = Vec::new();
         pfm::encode(map.view(), &mut again).expect("in memory");
-        let Ok(pfm::Pfm::Gray(read)) = pfm::decode(&again) else { panic!("what was written is not read") };
+        let Ok(pfm::Pfm::Gray(read)) = pfm::decode(&again) else { panic!("a written map cannot be read") };
         let same = |(a, b): (&f32, &f32)| a == b || (a.is_nan() && b.is_nan());
         assert!(map.as_slice().iter().zip(read.as_slice()).all(same));
     }
-    only_if(bytes.starts_with(b"P"))
+    keep_if(bytes.starts_with(b"P"))
 }
 
 pub fn npy_array(bytes: &[u8]) -> Corpus {
     if let Ok(array) = npy::decode_with(bytes, &OPTIONS) {
-        let again = npy::encode(&array).expect("it was read");
-        assert_eq!(npy::encode(&npy::decode(&again).expect("it was written")).ok(), Some(again));
+        let again = npy::encode(&array).expect("a decoded array can be encoded");
+        assert_eq!(npy::encode(&npy::decode(&again).expect("an encoded array can be decoded")).ok(), Some(again));
         let _ = (array.to_gray(), cv_io::keypoints_from_npy(&array), cv_io::descriptors_from_npy(&array));
     }
-    only_if(bytes.starts_with(b"\x93NUMPY"))
+    keep_if(bytes.starts_with(b"\x93NUMPY"))
 }
 
 pub fn npz_arrays(bytes: &[u8]) -> Corpus {
@@ -110,13 +111,13 @@ pub fn npz_arrays(bytes: &[u8]) -> Corpus {
     if let Ok(arrays) = npz::decode_with(bytes, &OPTIONS) {
         let arrays: Vec<_> = arrays.iter().map(|(name, array)| (name.as_str(), array)).collect();
         if let Ok(again) = npz::encode(&arrays, true) {
-            assert_eq!(npz::decode(&again).expect("it was written").len(), arrays.len());
+            assert_eq!(npz::decode(&again).expect("an encoded archive can be decoded").len(), arrays.len());
         }
     }
-    only_if(bytes.starts_with(b"PK"))
+    keep_if(bytes.starts_with(b"PK"))
 }
 
-/// Any cloud is written; the header counts what follows.
+/// Fuzzes the PLY writer with any cloud; asserts that the header's counts are those of the data.
 pub fn ply_cloud(bytes: &[u8]) -> Corpus {
     let mut input = arbitrary::Unstructured::new(bytes);
     let Ok((positions, colors, normals, edges)) = Arbitrary::arbitrary(&mut input) else { return Corpus::Reject };
@@ -136,12 +137,12 @@ pub fn ply_cloud(bytes: &[u8]) -> Corpus {
     Corpus::Keep
 }
 
-/// A calibration of one camera, in every format: what is understood is written in each and read back.
+/// Fuzzes the reader of cameras in every format; asserts that a parsed camera round-trips through each.
 pub fn camera(bytes: &[u8]) -> Corpus {
     let Ok(text) = std::str::from_utf8(bytes) else { return Corpus::Reject };
     for size in [None, Some((640, 480))] {
         let Ok(camera) = cv_io::parse_camera(text, size) else { continue };
-        camera.validate().expect("a camera that is read is one");
+        camera.validate().expect("a parsed camera is valid");
         for format in CalibrationFormat::all().filter(|format| format.writes_cameras()) {
             let Ok(written) = format.camera_text(&camera, &[]) else { continue };
             let again = cv_io::parse_camera(&written, Some((camera.width, camera.height)));
@@ -164,7 +165,7 @@ pub fn rig(bytes: &[u8]) -> Corpus {
     Corpus::Keep
 }
 
-/// Two or more cameras that are fixed to each other: `schema: cv-rig/2`, and Kalibr's chains.
+/// Fuzzes the reader of rigs of two or more cameras: `schema: cv-rig/2`, and Kalibr's chains.
 pub fn camera_array(bytes: &[u8]) -> Corpus {
     let Ok(text) = std::str::from_utf8(bytes) else { return Corpus::Reject };
     let Ok(file) = cv_io::parse_camera_array(text) else { return Corpus::Keep };
@@ -180,7 +181,7 @@ pub fn camera_array(bytes: &[u8]) -> Corpus {
     Corpus::Keep
 }
 
-/// The three files of a COLMAP model, binary and as text.
+/// Fuzzes the readers of the three files of a COLMAP model, binary and text.
 pub fn colmap(bytes: &[u8]) -> Corpus {
     use cv_io::colmap::{parse_cameras_binary, parse_images_binary, parse_points_binary};
     let binary =

@@ -1,4 +1,4 @@
-//! Small structured inputs to the jobs of `cv-pipeline` and the geometry below them.
+//! Fuzzes the jobs of `cv-pipeline` and the geometry below them with small structured inputs.
 
 use crate::structured::{self as make, Input};
 use arbitrary::Unstructured;
@@ -16,10 +16,10 @@ use cv_pipeline::{
 };
 use libfuzzer_sys::Corpus;
 
-/// Few enough samples that an input takes about a millisecond.
-fn search(u: &mut Unstructured<'_>, usual: RobustOptions) -> RobustOptions {
+/// Returns options with few enough iterations for about a millisecond per input.
+fn robust_options(u: &mut Unstructured<'_>, defaults: RobustOptions) -> RobustOptions {
     let threshold = if make::whole(u, 0, 15) == 0 { make::number(u) } else { make::within(u, 0.1, 8.0) };
-    RobustOptions { threshold, max_iterations: make::whole(u, 1, 200), seed: make::whole(u, 0, 255) as u64, ..usual }
+    RobustOptions { threshold, max_iterations: make::whole(u, 1, 200), seed: make::whole(u, 0, 255) as u64, ..defaults }
 }
 
 /// `cv estimate homography|fundamental`, and the essential matrix of known cameras.
@@ -27,7 +27,7 @@ pub fn estimate(bytes: &[u8]) -> Corpus {
     let u = &mut Unstructured::new(bytes);
     let Input { pairs, .. } = Input::of(u);
     for kind in [ModelKind::Homography, ModelKind::Fundamental] {
-        let options = search(u, kind.options());
+        let options = robust_options(u, kind.options());
         if let Ok(found) = cv_pipeline::estimate(&pairs, kind, &options, &Silent) {
             let robust = found.robust;
             assert!(robust.model.iter().all(|v| v.is_finite()), "{:?}", robust.model);
@@ -38,22 +38,22 @@ pub fn estimate(bytes: &[u8]) -> Corpus {
     Corpus::Keep
 }
 
-/// What a panorama does with the matches of a pair.
+/// Verification of an image pair of a panorama.
 pub fn homography_pair(bytes: &[u8]) -> Corpus {
     let u = &mut Unstructured::new(bytes);
     let Input { size, pairs, .. } = Input::of(u);
-    let RobustOptions { threshold, seed, .. } = search(u, RobustOptions::homography());
+    let RobustOptions { threshold, seed, .. } = robust_options(u, RobustOptions::homography());
     let options = VerifyOptions { threshold, seed, ..VerifyOptions::default() };
     let _ = verify_pair((0, size), (1, size), &pairs, &options);
     Corpus::Keep
 }
 
-/// Pose from matches of calibrated cameras.
+/// Relative pose from matches of calibrated cameras.
 pub fn relative_pose(bytes: &[u8]) -> Corpus {
     let u = &mut Unstructured::new(bytes);
     let Input { size, pairs, .. } = Input::of(u);
     let cameras = [make::camera(u, size), make::camera(u, size)];
-    let robust = search(u, RobustOptions::fundamental());
+    let robust = robust_options(u, RobustOptions::fundamental());
     let _ = cv_pipeline::estimate_calibrated(&pairs, &cameras, &robust, &Silent);
     let (normalized, unit) = normalize_matches(&pairs, &cameras[0], &cameras[1]);
     let robust = RobustOptions { threshold: robust.threshold * unit, ..robust };
@@ -61,7 +61,7 @@ pub fn relative_pose(bytes: &[u8]) -> Corpus {
     Corpus::Keep
 }
 
-/// Reconstruction from matches, all that is known of cameras.
+/// Two-view reconstruction from matches, with any knowledge of the intrinsics.
 pub fn two_view(bytes: &[u8]) -> Corpus {
     let u = &mut Unstructured::new(bytes);
     let Input { size, focal, pairs } = Input::of(u);
@@ -75,13 +75,18 @@ pub fn two_view(bytes: &[u8]) -> Corpus {
     let point = |x: f64, y: f64| Keypoint::new(x as f32, y as f32, 1.0);
     let a: Vec<Keypoint> = pairs.iter().map(|p| point(p.a.x, p.a.y)).collect();
     let b: Vec<Keypoint> = pairs.iter().map(|p| point(p.b.x, p.b.y)).collect();
-    let last = u32::from(make::whole(u, 0, 15) == 0);
-    let matches: Vec<DMatch> =
-        (0..pairs.len() as u32).map(|i| DMatch { query: i, train: i + last, distance: 0.5, ratio: 0.5 }).collect();
+    let index_offset = u32::from(make::whole(u, 0, 15) == 0);
+    let matches: Vec<DMatch> = (0..pairs.len() as u32)
+        .map(|i| DMatch { query: i, train: i + index_offset, distance: 0.5, ratio: 0.5 })
+        .collect();
     let views = MatchedViews { sizes: [size; 2], keypoints: [&a, &b], matches: &matches };
-    let usual = TwoViewOptions::default();
-    let options =
-        TwoViewOptions { intrinsics, robust: search(u, usual.robust), min_inliers: make::whole(u, 0, 30), ..usual };
+    let defaults = TwoViewOptions::default();
+    let options = TwoViewOptions {
+        intrinsics,
+        robust: robust_options(u, defaults.robust),
+        min_inliers: make::whole(u, 0, 30),
+        ..defaults
+    };
     if let Ok(scene) = reconstruct_two_views(&views, &options, &Silent) {
         assert!(scene.points.iter().all(|p| p.position.coords.iter().all(|v| v.is_finite())));
         assert!(scene.reprojection_rms.is_finite() && !scene.points.is_empty());
@@ -90,10 +95,10 @@ pub fn two_view(bytes: &[u8]) -> Corpus {
 }
 
 fn depth_options(u: &mut Unstructured<'_>) -> DepthOptions {
-    let strange = make::whole(u, 0, 15) == 0;
+    let is_extreme = make::whole(u, 0, 15) == 0;
     let stereo = StereoOptions {
         min_disparity: make::whole(u, 0, 40) as i32 - 20,
-        disparities: if strange { make::whole(u, 0, 1 << 20) } else { 16 * make::whole(u, 1, 4) },
+        disparities: if is_extreme { make::whole(u, 0, 1 << 20) } else { 16 * make::whole(u, 1, 4) },
         p1: u.arbitrary().unwrap_or(4),
         p2: u.arbitrary().unwrap_or(20),
         uniqueness: u.arbitrary().unwrap_or(5),
@@ -110,7 +115,7 @@ fn depth_options(u: &mut Unstructured<'_>) -> DepthOptions {
         0 => DisparityRange::FromMatches { min: None },
         _ => DisparityRange::Given,
     };
-    let range = if strange { (make::number(u) as f32, make::number(u) as f32) } else { (0.0, f32::INFINITY) };
+    let range = if is_extreme { (make::number(u) as f32, make::number(u) as f32) } else { (0.0, f32::INFINITY) };
     DepthOptions { stereo, disparities, range, ..DepthOptions::default() }
 }
 
@@ -131,7 +136,7 @@ pub fn depth(bytes: &[u8]) -> Corpus {
     Corpus::Keep
 }
 
-/// Rectification by any rig, and depth by it.
+/// Rectification and depth by any rig.
 pub fn rig_depth(bytes: &[u8]) -> Corpus {
     let u = &mut Unstructured::new(bytes);
     let size = (make::whole(u, 1, 48), make::whole(u, 1, 36));
@@ -148,7 +153,7 @@ pub fn rig_depth(bytes: &[u8]) -> Corpus {
     Corpus::Keep
 }
 
-/// Matching, and a panorama of what was matched.
+/// Matching and stitching.
 pub fn panorama(bytes: &[u8]) -> Corpus {
     let u = &mut Unstructured::new(bytes);
     let size = (make::whole(u, 0, 96), make::whole(u, 0, 80));
@@ -170,17 +175,17 @@ pub fn panorama(bytes: &[u8]) -> Corpus {
         .collect();
     let projections = [Projection::Auto, Projection::Plane, Projection::Cylindrical, Projection::Spherical];
     let blends = [BlendMode::Multiband, BlendMode::Feather, BlendMode::None];
-    let usual = PanoramaOptions::default();
+    let defaults = PanoramaOptions::default();
     let render = CompositingOptions {
         projection: projections[make::whole(u, 0, 3)],
         blend: blends[make::whole(u, 0, 2)],
         crop: make::flag(u),
         max_pixels: make::whole(u, 0, 1 << 18),
-        ..usual.render.clone()
+        ..defaults.render.clone()
     };
     let methods = [FeatureMethod::Sift, FeatureMethod::Mops];
-    let matching = MatchingOptions { features: methods[make::whole(u, 0, 1)].into(), ..usual.matching.clone() };
-    let options = PanoramaOptions { matching, render, ..usual };
+    let matching = MatchingOptions { features: methods[make::whole(u, 0, 1)].into(), ..defaults.matching.clone() };
+    let options = PanoramaOptions { matching, render, ..defaults };
     if let Ok(found) = cv_pipeline::panorama(&inputs, &options, &Silent) {
         assert!(found.images.len() == inputs.len() && found.image.size() == found.mask.size());
     }
@@ -195,7 +200,7 @@ pub fn segment(bytes: &[u8]) -> Corpus {
             let seed = u.arbitrary::<u16>().unwrap_or(0).into();
             let photo = make::photo(u, size, 0, 0, seed);
             let cut = make::whole(u, 0, 255) as u8;
-            // Now and then of another size than the photograph.
+            // Sometimes of another size than the photograph.
             let wider = usize::from(make::whole(u, 0, 31) == 0);
             let mask =
                 Mask::from_fn(size.0 + wider, size.1, |x, y| [size.0 > x && photo.at(x.min(size.0 - 1), y)[0] > cut]);
@@ -215,17 +220,17 @@ pub fn segment(bytes: &[u8]) -> Corpus {
     if let Ok(training) = cv_pipeline::train_segment(&labeled, &options, &Silent) {
         let model = training.trained.model;
         for (photo, _) in &photos {
-            let found = cv_pipeline::segment(photo.view(), &model, &Silent).expect("nobody stops it");
+            let found = cv_pipeline::segment(photo.view(), &model, &Silent).expect("there is no cancellation");
             assert_eq!(found.mask.size(), photo.size());
         }
-        let text = serde_json::to_string(&model).expect("it is data");
+        let text = serde_json::to_string(&model).expect("a model can be serialized");
         let again: Result<cv_pipeline::segmentation::ColorModel, _> = serde_json::from_str(&text);
-        assert!(again.is_ok(), "a model that is trained can be read: {again:?}\n{text}");
+        assert!(again.is_ok(), "a trained model must be readable: {again:?}\n{text}");
     }
     Corpus::Keep
 }
 
-/// Features and matches of two small photographs.
+/// Features and matches of two small images.
 pub fn match_photos(bytes: &[u8]) -> Corpus {
     let u = &mut Unstructured::new(bytes);
     let size = (make::whole(u, 0, 80), make::whole(u, 0, 64));

@@ -1,4 +1,4 @@
-"""Pictures that the tests share: the small generated ones of the repository, whose truth lies beside them."""
+"""Fixtures: the small generated images of the repository with their ground truth."""
 
 import json
 import os
@@ -9,7 +9,7 @@ import epipole
 import numpy as np
 import pytest
 
-# A shell that starts this in the background has Ctrl-C ignored, here and in every process from here on.
+# A shell that runs the tests in the background makes them, and all their child processes, ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 FIXTURES = Path(os.environ.get("EPIPOLE_FIXTURES", Path(__file__).parents[2] / "fixtures"))
@@ -23,7 +23,7 @@ def pair():
 
 @pytest.fixture(scope="session")
 def stereo_truth():
-    """Focal length in px, baseline in meters, true disparity, and where both photographs see the scene."""
+    """Focal length in px, baseline in meters, true disparity, and the mask of the pixels visible in both views."""
     known = json.loads((FIXTURES / "oracle" / "stereo.json").read_text())
     disparity = epipole.read_map(FIXTURES / "oracle" / "stereo-disparity.png")
     visible = epipole.read_image(FIXTURES / "oracle" / "stereo-visible.png") > 0

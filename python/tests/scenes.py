@@ -1,10 +1,10 @@
-"""Small scenes of textured planes, rendered with NumPy alone: their cameras and depths are the truth."""
+"""Small scenes of textured planes, rendered with NumPy alone: cameras and depths are known exactly."""
 
 import numpy as np
 
 
 def texture(seed):
-    """A random color at each place of a plane: noise of several sizes, in meters."""
+    """Returns the color at each position of a plane: noise of several scales, in meters."""
     random = np.random.default_rng(seed)
     layers = [(random.uniform(0, 1, (257, 257, 3)), cell) for cell in (0.7, 0.2, 0.06, 0.025)]
 
@@ -22,7 +22,7 @@ def texture(seed):
 
 
 def chessboard(columns, rows, square):
-    """A board of so many inner corners on white: the first of them is the origin."""
+    """Returns the colors of a chessboard on white; the origin is the first inner corner."""
 
     def color(u, v):
         i, j = np.floor(u / square).astype(int), np.floor(v / square).astype(int)
@@ -34,7 +34,7 @@ def chessboard(columns, rows, square):
 
 
 def rotation(x, y, z):
-    """Turns about the axes, in radians: z first."""
+    """Returns the rotation by angles about the axes in radians, z first."""
     cos, sin = np.cos([x, y, z]), np.sin([x, y, z])
     about_x = np.array([[1, 0, 0], [0, cos[0], -sin[0]], [0, sin[0], cos[0]]])
     about_y = np.array([[cos[1], 0, sin[1]], [0, 1, 0], [-sin[1], 0, cos[1]]])
@@ -43,7 +43,7 @@ def rotation(x, y, z):
 
 
 def render(planes, matrix, pose, size, oversampling=3):
-    """A photograph by a pinhole: planes are (origin, axis u, axis v, color), the pose is R, t of x = R X + t. Also the depth of each pixel's center."""
+    """Renders a photograph of a pinhole camera: planes are (origin, axis u, axis v, color), the pose is R, t of x = R X + t. Also returns the depth of each pixel's center."""
     (width, height), (r, t) = size, pose
     step = (np.arange(oversampling) - (oversampling - 1) / 2) / oversampling
     sums, depth = np.zeros((height, width, 3)), None

@@ -1,4 +1,4 @@
-"""Which arrays are taken, which of them without a copy, and what the others raise."""
+"""Accepted arrays, arrays used without a copy, and the exceptions of the others."""
 
 import epipole
 import numpy as np
@@ -72,18 +72,18 @@ def test_read_only_arrays_and_other_libraries_arrays(pair):
         ([[1, 2], [3, 4]], TypeError, "NumPy array"),
         ("left.png", TypeError, "NumPy array"),
         (None, TypeError, "NumPy array"),
-        # 100 GB by its shape, without memory behind it.
+        # 100 GB by its shape, without allocated memory.
         (np.broadcast_to(np.uint8(0), (1 << 18, 1 << 18, 3))[:, :, :2], errors.ShapeError, "shape"),
     ],
 )
-def test_what_is_no_image_is_refused(image, error, words):
+def test_invalid_arrays_are_refused(image, error, words):
     with pytest.raises(error, match=words):
         epipole.depth(image, image)
     with pytest.raises(error, match=words):
         epipole.match_features(image, np.zeros((60, 60, 3), np.uint8))
 
 
-def test_images_that_do_not_go_together():
+def test_incompatible_images_are_refused():
     a = np.zeros((40, 50), np.uint8)
     with pytest.raises(errors.ImageMismatchError) as refused:
         epipole.depth(a, a.astype(np.uint16))
@@ -93,7 +93,7 @@ def test_images_that_do_not_go_together():
     assert (refused.value.left, refused.value.right) == ((50, 40), (50, 39))
 
 
-def test_photographs_that_are_not_finite_are_refused(pair):
+def test_non_finite_photographs_are_refused(pair):
     left, right = (photo.astype(np.float32) / 255 for photo in pair)
     left[50:60, 50:60] = np.nan
     with pytest.raises(errors.NotFiniteError) as refused:

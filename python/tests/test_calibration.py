@@ -1,4 +1,4 @@
-"""Cameras, rigs, boards: beside the cameras that rendered the photographs."""
+"""Cameras, rigs and boards, against the cameras that rendered the photographs."""
 
 import pickle
 
@@ -12,12 +12,12 @@ MATRIX = np.array([[420.0, 0, 163.0], [0, 418.0, 117.0], [0, 0, 1]])
 SIZE = (320, 240)
 # Meters.
 SQUARE = 0.034
-# Of a rig: 0.12 to the right of the first camera, turned a little.
+# Second camera of a rig: 0.12 to the right of the first, slightly rotated.
 RIG = (scenes.rotation(0.01, -0.02, 0.005), np.array([-0.12, 0.002, 0.003]))
 
 
 def board_poses():
-    """Places of the board in front of the camera, in meters."""
+    """Poses of the board in front of the camera, in meters."""
     random = np.random.default_rng(3)
     for i in range(12):
         tilt = scenes.rotation(*(random.uniform(-0.45, 0.45, 3)))
@@ -27,7 +27,7 @@ def board_poses():
 
 @pytest.fixture(scope="module")
 def photographs():
-    """Of a chessboard of 8 by 5 inner corners, 34 mm apart, by both cameras of a rig."""
+    """Photographs of a chessboard of 8 by 5 inner corners with squares of 34 mm, by both cameras of a rig."""
     board = [((0, 0, 0), np.eye(3)[0], np.eye(3)[1], scenes.chessboard(8, 5, SQUARE))]
     r, t = RIG
     left = [scenes.render(board, MATRIX, pose, SIZE)[0] for pose in board_poses()]
@@ -35,14 +35,14 @@ def photographs():
     return left, right
 
 
-def test_the_corners_of_a_board_are_where_they_are(photographs):
+def test_the_corners_of_a_board_are_accurate(photographs):
     pose = next(iter(board_poses()))
     seen = epipole.find_board(photographs[0][0], board=epipole.Chessboard((8, 5), SQUARE))
     assert len(seen) == 40 and seen.size == (8, 5)
     true = np.c_[seen.points, np.zeros(40)] @ pose[0].T + pose[1]
     pixels = true @ MATRIX.T
     off = np.linalg.norm(seen.pixels - pixels[:, :2] / pixels[:, 2:], axis=1)
-    # The project's bar for clean generated photographs; sampling 3×3 per pixel adds as much.
+    # The target for clean generated photographs; rendering with 3×3 samples per pixel adds as much.
     assert np.median(off) < 0.06
     assert len(epipole.find_board(photographs[0][0])) == 40
     with pytest.raises(errors.BoardNotFoundError) as refused:
@@ -56,7 +56,7 @@ def test_a_rig_is_calibrated(photographs, tmp_path):
     seen = []
     found = epipole.calibrate(list(photographs), board=epipole.Chessboard((8, 5), SQUARE), progress=lambda *at: seen.append(at))
     assert found.rms < 0.1 and len(found.cameras) == 2 and seen
-    # Twelve photographs of 40 corners good to 0.03 px: deviations of about a pixel, which are stated.
+    # Twelve photographs of 40 corners accurate to 0.03 px: standard deviations of about a pixel, which are reported.
     deviations = dict(zip(found.parameter_names, found.deviations))
     assert abs(found.cameras[0].matrix[0, 0] - 420) < 4 * deviations["camera0.fx"] < 8
     assert found.covariance.shape == (len(found.parameters),) * 2
@@ -73,7 +73,7 @@ def test_a_rig_is_calibrated(photographs, tmp_path):
     assert epipole.Rig.read(tmp_path / "rig.yaml").left == found.rig.left
 
 
-def test_missing_and_empty_photographs_are_told_of(photographs):
+def test_missing_and_empty_photographs_are_reported(photographs):
     left = list(photographs[0])
     left[2], left[3] = None, np.zeros((240, 320), np.uint8)
     found = epipole.calibrate(left, board=epipole.Chessboard((8, 5), SQUARE), lens="radial-tangential4")
@@ -88,7 +88,7 @@ def test_missing_and_empty_photographs_are_told_of(photographs):
         epipole.calibrate([left, left[:3]])
 
 
-def test_cameras_project_and_are_written(tmp_path):
+def test_cameras_project_and_round_trip_through_files(tmp_path):
     camera = epipole.Camera(640, 480, [[500, 0, 320], [0, 510, 240], [0, 0, 1]], [-0.2, 0.05, 0.001, -0.002, 0.01])
     assert camera.lens == "radial_tangential5" and camera.distortion.shape == (5,)
     points = np.array([[0.1, -0.2, 2.0], [0.4, 0.3, 1.5], [0, 0, -1]])
@@ -141,13 +141,13 @@ def test_a_pair_of_a_rig_is_rectified_and_gives_depth():
     assert np.allclose(pair.Q, epipole.depth(left, right, rig=rig, disparities=48).Q)
     found = epipole.depth(left, right, rig=rig, disparities=48, cloud=True)
     assert found.images[0].shape == left.shape and len(found.cloud) > 10_000
-    # The cloud is in the frame of the left camera as it stood: each point beside the depth that was rendered there.
+    # The cloud is in the frame of the original left camera: each point is compared with the rendered depth at its pixel.
     pixels = camera.project(found.cloud.positions)
     at = np.rint(pixels).astype(int)
     inside = (at >= 0).all(1) & (at < SIZE).all(1)
     true = depth[at[inside, 1], at[inside, 0]]
     off = np.abs(found.cloud.positions[inside, 2] / true - 1)
-    # The project's bar for what is nearer than 10 m.
+    # The target for depths below 10 m.
     assert np.mean(off < 0.05) > 0.95 and inside.mean() > 0.9
     with pytest.raises(TypeError):
         epipole.depth(left, right, rig=rig, focal=420, baseline=0.1)
@@ -157,7 +157,7 @@ def test_a_pair_of_a_rig_is_rectified_and_gives_depth():
         epipole.rectify(left, right, rig.exchanged())
 
 
-def test_a_bent_photograph_is_straightened():
+def test_a_distorted_photograph_is_undistorted():
     camera = epipole.Camera(*SIZE, MATRIX, [-0.25, 0.06, 0, 0])
     image, _ = scenes.render(scenes.room(), MATRIX, (np.eye(3), np.zeros(3)), SIZE)
     for given in (image, image[..., 0], image.astype(np.uint16) * 257, image.astype(np.float32) / 255):
@@ -166,14 +166,14 @@ def test_a_bent_photograph_is_straightened():
         assert straight.dtype == given.dtype and straight.shape == given.shape
         assert pinhole.lens == "none" and undistorter.camera == pinhole
         assert np.array_equal(undistorter.compute(given), straight)
-    # A pixel is what the bent photograph has where the camera sees the same ray.
+    # An undistorted pixel has the color of the distorted photograph on the same ray.
     straight, pinhole = epipole.undistort(image[..., 0].astype(np.float32), camera)
     rays = np.c_[pinhole.normalize([[100, 80], [250, 190]]), np.ones(2)]
     for (x, y), value in zip(camera.project(rays), (straight[80, 100], straight[190, 250])):
         i, j, a, b = int(x), int(y), x % 1, y % 1
         values = image[j : j + 2, i : i + 2, 0].astype(float)
         expected = np.array([1 - b, b]) @ values @ np.array([1 - a, a])
-        # Places are fixed-point, to a thirty-second of a pixel; neighbors differ by up to 60 levels.
+        # Source positions are fixed-point numbers of 1/32 px; neighboring pixels differ by up to 60 levels.
         assert abs(value - expected) < 2
     with pytest.raises(errors.ImageSizeError):
         epipole.undistort(image[:-1], camera)

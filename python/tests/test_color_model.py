@@ -1,4 +1,4 @@
-"""The ball of the generated photographs, found by its color; the model as an estimator of scikit-learn."""
+"""Segmentation of the ball in the generated photographs; the model as an estimator of scikit-learn."""
 
 import pickle
 
@@ -23,16 +23,16 @@ def fitted(balls):
     return epipole.ColorModel().fit(photographs[::2], masks[::2])
 
 
-def test_the_ball_is_found_on_other_photographs(balls, fitted):
+def test_the_ball_is_segmented_in_other_photographs(balls, fitted):
     photographs, masks = (part[1::2] for part in balls)
-    # The project's bar for generated scenes.
+    # The target for generated scenes.
     assert fitted.score(photographs, masks) >= 0.97
     found = fitted.predict(photographs)
     assert all(f.dtype == bool and f.shape == m.shape for f, m in zip(found, masks))
     assert np.array_equal(found[0], fitted.predict(photographs[0]))
     for photograph, mask in zip(photographs, masks):
         likely = fitted.predict_proba(photograph)
-        # Pixels of the border are half of something else.
+        # Pixels on the object's boundary blend object and background.
         assert likely.dtype == np.float32 and likely[mask].mean() > 0.8 > 0.1 > likely[~mask].mean()
         best = fitted.locate(photograph).objects[0]
         y, x = np.nonzero(mask)
@@ -42,7 +42,7 @@ def test_the_ball_is_found_on_other_photographs(balls, fitted):
     assert scores["true_positives"] == both and scores["iou"] == pytest.approx(both / (found[0] | masks[0]).sum())
 
 
-def test_it_is_kept_and_copied(balls, fitted, tmp_path):
+def test_a_model_is_saved_pickled_and_cloned(balls, fitted, tmp_path):
     photograph = balls[0][1]
     fitted.save(tmp_path / "ball.json")
     for again in (epipole.ColorModel.load(tmp_path / "ball.json"), pickle.loads(pickle.dumps(fitted))):
@@ -53,7 +53,7 @@ def test_it_is_kept_and_copied(balls, fitted, tmp_path):
         fitted.set_params(colour="red")
 
 
-def test_it_is_an_estimator_of_scikit_learn(balls):
+def test_the_model_is_a_scikit_learn_estimator(balls):
     sklearn = pytest.importorskip("sklearn")
     from sklearn.base import clone, is_classifier
     from sklearn.exceptions import NotFittedError
@@ -69,7 +69,7 @@ def test_it_is_an_estimator_of_scikit_learn(balls):
     assert pipeline.named_steps["ball"].components == 4 and pipeline.score(photographs[1::2], masks[1::2]) > 0.95
 
 
-def test_what_cannot_be_learned(balls):
+def test_invalid_training_input_is_refused(balls):
     photographs, masks = balls
     empty = [np.zeros_like(m) for m in masks[:2]]
     with pytest.raises(errors.NoForegroundError) as refused:

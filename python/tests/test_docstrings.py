@@ -1,4 +1,4 @@
-"""The examples of the docstrings do what they say."""
+"""The examples of the docstrings give the stated results."""
 
 import doctest
 import inspect
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from epipole import boards, errors
 
-# Those whose call is most of what there is to know of them. What takes files or photographs of a scene is shown by the guides, which are run as well.
+# Functions with an example in their docstring. Functions of files or photographs are in the guides, which are tested as well.
 SHOWN = {
     "Camera",
     "ColorModel",
@@ -29,7 +29,7 @@ SHOWN = {
 
 
 def documented():
-    """Everything with a docstring that people meet, by name."""
+    """Returns all public objects with a docstring, by name."""
     found = {"epipole": epipole, "epipole.boards": boards, "epipole.errors": errors}
     for name in epipole.__all__:
         thing = getattr(epipole, name)
@@ -44,7 +44,7 @@ EXAMPLES = {name: text for name, text in documented().items() if ">>>" in text}
 
 
 @pytest.mark.parametrize("name", sorted(EXAMPLES))
-def test_an_example_does_what_it_says(name):
+def test_an_example_gives_the_stated_result(name):
     shown = {"epipole": epipole, "np": np}
     test = doctest.DocTestParser().get_doctest(EXAMPLES[name], shown, name, None, None)
     said = []
@@ -52,5 +52,5 @@ def test_an_example_does_what_it_says(name):
     assert results.attempted >= 1 and results.failed == 0, "".join(said)
 
 
-def test_what_is_to_be_shown_is():
+def test_the_listed_objects_have_an_example():
     assert SHOWN <= set(EXAMPLES)

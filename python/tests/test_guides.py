@@ -1,4 +1,4 @@
-"""The blocks of the guides and the cells of the notebooks run, on generated photographs; and they satisfy the strictest type checker."""
+"""The blocks of the guides and the cells of the notebooks run on generated photographs, and pass strict type checking."""
 
 import json
 import os
@@ -21,7 +21,7 @@ NEEDS = {"from-cv2.md": ["cv2"], "cluster.md": ["ray", "daft"]}
 
 @pytest.fixture(scope="session")
 def photographs(tmp_path_factory):
-    """The folder that guides work in: the fixtures, and twelve photographs of a chessboard."""
+    """The working folder of the guides: the fixtures, and twelve photographs of a chessboard."""
     folder = tmp_path_factory.mktemp("guides")
     for part in ("stereo", "plane", "panorama", "ball", "two-view", "oracle/ball-masks"):
         for path in (FIXTURES / part).iterdir():
@@ -44,7 +44,7 @@ def photographs(tmp_path_factory):
 
 
 def program(path):
-    """What a guide or a notebook runs, as one program."""
+    """Returns the code of a guide or a notebook as one program."""
     if path.suffix == ".ipynb":
         cells = json.loads(path.read_text())["cells"]
         return "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code") + "\n"
@@ -55,7 +55,7 @@ GUIDES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((RO
 
 
 @pytest.mark.parametrize("path", GUIDES, ids=lambda path: path.name)
-def test_a_guide_does_what_it_says(path, photographs, tmp_path):
+def test_a_guide_runs(path, photographs, tmp_path):
     for module in NEEDS.get(path.name, []):
         pytest.importorskip(module)
     text = program(path)
@@ -67,7 +67,7 @@ def test_a_guide_does_what_it_says(path, photographs, tmp_path):
     environment = {**os.environ, "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "DO_NOT_TRACK": "1", "PYTHONWARNINGS": "ignore"}
     # In the system's temporary folder, since paths of Unix sockets have at most 107 bytes.
     with tempfile.TemporaryDirectory(prefix="ray") as sessions:
-        # A cluster that was killed leaves its address behind: nobody listens on port 1.
+        # A killed cluster leaves its address file: here with port 1, on which nothing listens.
         Path(sessions, "ray").mkdir()
         Path(sessions, "ray", "ray_current_cluster").write_text("127.0.0.1:1")
         environment["RAY_TMPDIR"] = sessions
@@ -88,7 +88,7 @@ def test_examples_satisfy_pyright(tmp_path):
 
 def test_the_stub_is_that_of_the_library():
     pytest.importorskip("mypy")
-    # That no function is missing is tested beside the options.
+    # Completeness is tested with the options.
     command = [sys.executable, "-m", "mypy.stubtest", "epipole._native", "--ignore-missing-stub"]
     checked = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert checked.returncode == 0, checked.stdout[-3000:] + checked.stderr[-1000:]

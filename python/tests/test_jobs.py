@@ -1,4 +1,4 @@
-"""What the jobs find, beside the truth; options; and what they refuse."""
+"""Results of the jobs against ground truth; options; refused input."""
 
 import pickle
 
@@ -13,7 +13,7 @@ def test_depth_of_a_generated_room(pair, stereo_truth):
     found = epipole.depth(*pair, disparities=64, focal=focal, baseline=baseline, confidence=True)
     true_depth = focal * baseline / truth
     seen = visible & np.isfinite(true_depth) & (true_depth < 10)
-    # The project's bar: 95 % of the visible pixels within 5 %.
+    # The target: 95 % of the visible pixels within 5 %.
     assert (np.abs(found.depth - true_depth) <= 0.05 * true_depth)[seen].mean() >= 0.95
     assert found.matched.mean() == pytest.approx(found.matched_fraction)
     assert (found.confidence[found.matched] > 0).mean() > 0.9
@@ -24,7 +24,7 @@ def test_depth_of_a_generated_room(pair, stereo_truth):
     assert scores["bad"][2] == pytest.approx(np.mean(~(off <= 2)), abs=1e-9)
 
 
-def test_a_matcher_gives_what_depth_gives_and_writes_where_it_is_told(pair):
+def test_a_matcher_equals_depth_and_writes_to_the_given_array(pair):
     expected = epipole.depth(*pair, disparities=64).disparity
     matcher = epipole.StereoMatcher(disparities=64)
     assert np.array_equal(matcher.compute(*pair), expected, equal_nan=True)
@@ -47,7 +47,7 @@ def test_the_homography_of_a_plane(plane):
     height, width = a.shape[:2]
     corners = np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]]).T
     one, two = (h @ corners for h in (model.model, truth))
-    # The bar of the golden figures for the same pair.
+    # The target of the golden figures for the same pair.
     assert np.abs(one[:2] / one[2] - two[:2] / two[2]).max() < 0.3
     assert model.inliers.dtype == bool and model.inliers.sum() > 50
     first = found.keypoints[0][found.indices[:, 0], :2]
@@ -67,7 +67,7 @@ def test_the_pose_of_an_exact_pair():
         return x[:, :2] / x[:, 2:]
 
     matches = np.hstack([project(points), project(points @ rotation.T + translation)])
-    # A fifth is wrong.
+    # A fifth are outliers.
     matches[:16, 2:] += random.uniform(20, 60, (16, 2))
     found = epipole.estimate_essential(matches, k)
     assert np.allclose(found.rotation, rotation, atol=1e-6)
@@ -81,7 +81,7 @@ def test_the_pose_of_an_exact_pair():
         epipole.estimate_essential(matches, k.T)
 
 
-def test_refusals_carry_their_numbers():
+def test_errors_have_their_numbers():
     with pytest.raises(errors.NotEnoughMatchesError) as refused:
         epipole.estimate_fundamental(np.zeros((5, 4)))
     assert refused.value.got == 5 and refused.value.needed in (7, 8) and refused.value.kind == "NotEnoughMatches"
@@ -100,7 +100,7 @@ def test_refusals_carry_their_numbers():
         epipole.estimate_homography(np.zeros((0, 4)))
 
 
-def test_no_pair_and_unknown_geometry(pair):
+def test_unrelated_images_and_unknown_geometry(pair):
     gray = np.full_like(pair[0], 90)
     with pytest.raises(errors.NoPairError) as refused:
         epipole.depth(gray, pair[1], disparities=64)
@@ -138,7 +138,7 @@ def test_options_have_the_librarys_defaults(pair):
     defaults = epipole.defaults("depth")
     assert defaults["disparities"] == 128 and defaults["census"] == "5" and defaults["threads"] is None
     assert epipole.defaults("estimate_essential")["threshold"] == 1.0
-    # What is said to be the default is what is done without it.
+    # The documented default equals the behavior without the option.
     stereo = {k: v for k, v in epipole.defaults("StereoMatcher").items() if k not in ("threads", "progress")}
     a, b = epipole.StereoMatcher(**stereo), epipole.StereoMatcher()
     assert np.array_equal(a.compute(*pair), b.compute(*pair), equal_nan=True)
@@ -146,13 +146,13 @@ def test_options_have_the_librarys_defaults(pair):
         epipole.defaults("nothing")
 
 
-def test_numbers_are_names_too(pair):
+def test_named_values_may_be_numbers(pair):
     a = epipole.depth(*pair, disparities=64, paths=4).disparity
     b = epipole.depth(*pair, disparities=64, paths="4").disparity
     assert np.array_equal(a, b, equal_nan=True)
 
 
-def test_results_are_frozen_and_travel(pair, plane):
+def test_results_are_frozen_and_picklable(pair, plane):
     found = epipole.depth(*pair, disparities=64)
     with pytest.raises(AttributeError):
         found.disparity = None
@@ -164,7 +164,7 @@ def test_results_are_frozen_and_travel(pair, plane):
     assert str(len(matches)) in repr(matches) and "Model(" in repr(epipole.estimate_homography(matches.points))
 
 
-def test_files(tmp_path, pair):
+def test_files_round_trip(tmp_path, pair):
     image = pair[0]
     for name, written in (("a.png", image), ("b.tif", image.astype(np.uint16) * 257), ("c.png", image[:, :, 0])):
         epipole.write_image(tmp_path / name, written)

@@ -1,4 +1,4 @@
-"""Threads, signals, processes, memory: how the package behaves in a program."""
+"""Threads, signals, processes and memory of the package within a program."""
 
 import os
 import resource
@@ -25,14 +25,14 @@ def run(code, **options):
     ("job", "seconds"),
     [
         ("depth(image, turned, disparities=256)", 1.0),
-        # While views are simulated, at full size too.
+        # While ASIFT simulates views, also at full size.
         ("match_features(image, turned, affine_simulation='always')", 4.0),
         ("sfm([image, turned, image[::-1].copy()])", 1.0),
         ("panorama([np.repeat(np.roll(image, shift, 1)[:, :3000, None], 3, 2) for shift in (0, 1200)])", 0.6),
     ],
 )
-def test_control_c_stops_a_long_job_soon(job, seconds):
-    # Two pictures of 12 Mpx take seconds.
+def test_control_c_stops_a_long_job_within_the_limit(job, seconds):
+    # Two images of 12 Mpx take seconds.
     found = run(
         f"""
         import os, signal, threading, time
@@ -50,11 +50,11 @@ def test_control_c_stops_a_long_job_soon(job, seconds):
         """
     )
     assert found.stdout, found.stderr
-    # 0.2 s asked for; the tick takes 0.05 of it, and the test machine may be busy.
+    # The target is 0.2 s; the tick takes 0.05 s of it, and the test machine may be busy.
     assert float(found.stdout) < 0.5
 
 
-def test_progress_is_told_and_may_stop_a_job(pair):
+def test_progress_is_reported_and_may_stop_a_job(pair):
     told = []
     epipole.depth(*pair, disparities=64, progress=lambda stage, done, total: told.append((stage, done, total)))
     assert told and all(isinstance(stage, str) and done <= max(done, total) for stage, done, total in told)
@@ -67,7 +67,7 @@ def test_progress_is_told_and_may_stop_a_job(pair):
         epipole.depth(big, big, disparities=256, progress=stop)
 
 
-def test_other_threads_go_on(pair):
+def test_other_threads_run_during_a_job(pair):
     big = np.random.default_rng(0).integers(0, 255, (1500, 2000), np.uint8)
     ended = threading.Event()
     job = threading.Thread(target=lambda: (epipole.StereoMatcher(disparities=256).compute(big, big), ended.set()))
@@ -76,7 +76,7 @@ def test_other_threads_go_on(pair):
     while not ended.is_set() and count < 20:
         time.sleep(0.005)
         count += 1
-    # With the interpreter held, not one round would be done before the end.
+    # If the job kept the GIL, no round would complete before its end.
     assert count >= 20
     job.join()
 
@@ -99,7 +99,7 @@ def test_the_same_bytes_for_any_number_of_threads(pair, plane, threads):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
-def test_a_child_of_a_fork_works_too():
+def test_jobs_work_in_a_forked_process():
     found = run(
         """
         import os, epipole, numpy as np
@@ -115,7 +115,7 @@ def test_a_child_of_a_fork_works_too():
     assert found.stdout.strip() == "0", found.stderr
 
 
-def test_many_calls_need_no_more_memory():
+def test_repeated_calls_leak_no_memory():
     image = np.random.default_rng(0).integers(0, 255, (24, 48, 3), np.uint8)
     matcher = epipole.StereoMatcher(disparities=8)
     peaks = []
@@ -123,9 +123,9 @@ def test_many_calls_need_no_more_memory():
         for _ in range(1000):
             matcher.compute(image, image[::1])
         peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-    # Kilobytes. A result that stayed would be 9000 × 4.6 kB.
+    # Kilobytes. Leaked results would be 9000 × 4.6 kB.
     assert peaks[-1] - peaks[0] < 8000
 
 
-def test_the_signal_of_this_process_is_as_it_was():
+def test_the_signal_handler_is_restored():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -11,7 +11,7 @@ from epipole import errors
 VIEWS = [FIXTURES / "panorama" / f"view{i}.jpg" for i in range(3)]
 
 
-def test_photographs_are_joined_and_strangers_left_out(plane):
+def test_photographs_are_stitched_and_unrelated_ones_left_out(plane):
     known = json.loads((FIXTURES / "oracle" / "panorama.json").read_text())
     photographs = [epipole.read_image(path) for path in VIEWS]
     found = epipole.panorama([*photographs, plane[0]], focal=known["focal_px"])
@@ -23,14 +23,14 @@ def test_photographs_are_joined_and_strangers_left_out(plane):
     (k0, r0), (k1, r1) = found.views[0], found.views[1]
     mapped = k1.matrix @ r1 @ r0.T @ np.linalg.inv(k0.matrix) @ corners
     true = np.array(known["homographies"][0]) @ corners
-    # The homographies of the file are of neighbors, from the second of them to the first or back.
+    # The homographies of the file are between neighbors, in either direction.
     both = [np.abs(mapped[:2] / mapped[2] - h[:2] / h[2]).max() for h in (true, np.linalg.inv(known["homographies"][0]) @ corners)]
-    # The bar of the golden figures: a pixel and a half at the corners.
+    # The target of the golden figures: 1.5 px at the corners.
     assert min(both) < 1.5
     assert "3 photographs" in repr(found) and "<img" in found._repr_html_()
 
 
-def test_paths_are_read_and_arrays_are_the_same():
+def test_paths_and_arrays_give_the_same_result():
     found = epipole.panorama(VIEWS, scale=0.5)
     again = epipole.panorama([epipole.read_image(path) for path in VIEWS], scale=0.5)
     assert np.array_equal(found.image, again.image)
@@ -42,13 +42,13 @@ def test_paths_are_read_and_arrays_are_the_same():
         epipole.panorama(VIEWS, projection="cubic")
 
 
-def test_sixteen_bits_stay():
+def test_16_bit_photographs_give_a_16_bit_panorama():
     photographs = [epipole.read_image(path) for path in VIEWS]
     deep = [p.astype(np.uint16) * 257 for p in photographs]
     plain = epipole.panorama(photographs, scale=0.5)
     found = epipole.panorama(deep, scale=0.5)
     assert plain.image.dtype == np.uint8 and found.image.dtype == np.uint16 and found.image.shape == plain.image.shape
-    # The same but for rounding, and where that moves a seam.
+    # The same up to rounding, except where rounding moves a seam.
     assert (np.abs(found.image / 257 - plain.image) > 1.1).mean() < 1e-3 and (found.image % 257 != 0).mean() > 0.9
     assert "<img" in found._repr_html_()
     mixed = epipole.panorama([photographs[0], *deep[1:]], scale=0.5)
@@ -57,7 +57,7 @@ def test_sixteen_bits_stay():
         epipole.panorama([p.astype(np.float32) for p in photographs])
 
 
-def test_a_part_of_the_scene_is_drawn():
+def test_a_field_of_view_is_rendered():
     whole = epipole.panorama(VIEWS, scale=0.5, projection="stereographic")
     part = epipole.panorama(VIEWS, scale=0.5, projection="stereographic", fov=(40, 30), center=(-3, 1), roll=2.0)
     # 2 tan(fov / 4) to each side: the ratio of the sides is that of the tangents, to a pixel.
@@ -73,7 +73,7 @@ def test_a_part_of_the_scene_is_drawn():
         epipole.panorama(VIEWS, projection="plane", fov=170)
 
 
-def test_a_registration_serves_other_photographs_of_the_views():
+def test_a_registration_renders_other_photographs_of_the_views():
     photographs = [epipole.read_image(path) for path in VIEWS]
     first = epipole.panorama(photographs, scale=0.5)
     again = epipole.panorama(photographs, scale=0.5, registration=first.registration)

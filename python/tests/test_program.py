@@ -1,4 +1,4 @@
-"""What the program writes for the generated photographs of the repository is what the package finds, byte for byte."""
+"""The package's results for the generated photographs of the repository equal the program's outputs, byte for byte."""
 
 import json
 import os
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.skipif(not PROGRAM, reason="EPIPOLE_PROGRAM does not na
 
 
 def run(*arguments):
-    """The program, and what it says as JSON."""
+    """Runs the program and returns its JSON."""
     done = subprocess.run([PROGRAM, *map(str, arguments), "--json"], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -38,7 +38,7 @@ def test_matches_and_their_homography(plane, tmp_path):
     found = epipole.match_features(*plane[:2])
     assert told["matches"] == len(found)
     model = run("estimate", "homography", "--matches", tmp_path / "m.txt")
-    # The file has fewer digits than the matches; of the same ones, the same model.
+    # The file has fewer digits than the matches; the same matches give the same model.
     rows = np.loadtxt(tmp_path / "m.txt")[:, :4]
     assert np.abs(rows - found.points).max() < 1e-3
     assert np.array_equal(np.array(model["model"]).reshape(3, 3), epipole.estimate_homography(rows).model)

@@ -1,4 +1,4 @@
-"""Jobs over Ray Data on one machine: bad files, a worker that dies, a second run. Left out where Ray is not installed."""
+"""Jobs over Ray Data on one machine: broken files, a killed worker, a second run. Skipped if Ray is not installed."""
 
 import os
 import shutil
@@ -35,12 +35,12 @@ def rows(dataset):
 
 
 CORRUPT = {3, 9, 10, 57, 100, 101, 163, 200, 231, 239}
-"""Of the 240 pairs."""
+"""Indices of the broken pairs."""
 
 
 @pytest.fixture(scope="module")
 def pairs(tmp_path_factory):
-    """240 small pairs under names of their own, ten of them broken."""
+    """Writes 240 small pairs with unique names, ten of them broken."""
     folder = tmp_path_factory.mktemp("pairs")
     for side in ("left", "right"):
         image = epipole.read_image(FIXTURES / "stereo" / f"{side}.jpg")
@@ -48,7 +48,7 @@ def pairs(tmp_path_factory):
         for i in range(240):
             shutil.copy(folder / f"{side}.png", folder / f"{side}{i:03}.png")
     for i in CORRUPT:
-        (folder / f"left{i:03}.png").write_bytes(b"no picture")
+        (folder / f"left{i:03}.png").write_bytes(b"no image")
     return [(folder / f"left{i:03}.png", folder / f"right{i:03}.png") for i in range(240)]
 
 
@@ -76,7 +76,7 @@ def test_bad_files_are_rows_with_an_error_and_a_second_run_computes_nothing(clus
 
 
 def kill_one(folder, killed):
-    """Kills a worker once the first result is there."""
+    """Kills a worker after the first result."""
     end = time.monotonic() + 60
     while time.monotonic() < end and not list(folder.glob("d/*.npz")):
         time.sleep(0.02)
@@ -86,14 +86,14 @@ def kill_one(folder, killed):
                 command = file.read()
         except OSError:
             continue
-        # What Ray calls a worker that holds one of ours.
+        # Ray's process name of a worker with one of our actors.
         if b"MapWorker" in command and entry.isdigit():
             os.kill(int(entry), signal.SIGKILL)
             killed.append(command)
             return
 
 
-def test_the_other_jobs(cluster, tmp_path):
+def test_every_other_job_runs_on_the_cluster(cluster, tmp_path):
     photographs = [FIXTURES / "ball" / f"ball{i}.jpg" for i in range(4)]
     masks = [epipole.read_image(FIXTURES / "oracle" / "ball-masks" / f"ball{i}_mask.png") for i in range(4)]
     images = [epipole.read_image(path) for path in photographs]
@@ -122,7 +122,7 @@ def test_the_other_jobs(cluster, tmp_path):
     dataset = ray.data.from_items([{"a": files[0], "b": files[1]}])
     found = rows(epipole.ray.match_pairs(dataset, tmp_path / "m"))
     assert found[0]["count"] == len(expected) > 20 and found[0]["error"] is None
-    # As a list, with options, and beside a pair of which one is missing.
+    # As a list, with options, and with a pair of which one file is missing.
     listed = [(files[0], files[1]), (files[0], tmp_path / "nowhere.npz")]
     found = rows(epipole.ray.match_pairs(listed, tmp_path / "n", guided="homography", seed=3))
     assert [row["name"] for row in found] == ["a-b", "a-nowhere"]
@@ -145,13 +145,13 @@ def test_many_views_with_features_from_the_cluster(cluster, tmp_path):
     assert list(found.left_out) == ["4.png"] and "FileNotFoundError" in found.left_out["4.png"]["message"]
     expected = epipole.sfm(paths[:4], camera=camera)
     assert np.array_equal(found.model.points, expected.model.points)
-    # Two that cannot be read, of one name in two folders.
+    # Two unreadable files of the same name in two folders.
     more = [*paths[:4], tmp_path / "x" / "9.png", tmp_path / "y" / "9.png"]
     found = epipole.ray.sfm(more, tmp_path / "more", names=["a", "b", "c", "d", "x9", "y9"], camera=camera)
     assert sorted(found.left_out) == ["x9", "y9"] and [image.name for image in found.model.images.values()] == ["a", "b", "c", "d"]
 
 
-def test_mistakes_are_told_before_the_work(cluster, tmp_path):
+def test_invalid_options_are_reported_before_the_computation(cluster, tmp_path):
     paths = ["a/x.jpg", "b/x.jpg"]
     with pytest.raises(ValueError, match="names="):
         epipole.ray.features(paths, tmp_path / "f")

@@ -1,4 +1,4 @@
-"""Two views, many views, models and their files: beside the cameras that rendered the photographs."""
+"""Two views, many views, models and their files, against the cameras that rendered the photographs."""
 
 import pickle
 
@@ -13,7 +13,7 @@ SIZE = (400, 300)
 
 
 def walk():
-    """Poses along a line, each looking a little more to the right."""
+    """Returns poses along a line, each rotated a little more to the right."""
     for i in range(5):
         turn = scenes.rotation(0.02 * (i % 2), 0.25 - 0.07 * i, 0)
         center = np.array([-0.6 + 0.45 * i, 0.05 * (i % 2), -0.1 * i])
@@ -26,16 +26,16 @@ def photographs():
 
 
 def angle(a, b):
-    """Between two rotations, in degrees."""
-    # By the sine, which keeps its digits where the angle is small.
+    """Returns the angle between two rotations, in degrees."""
+    # By the sine, which is accurate for small angles.
     return np.degrees(2 * np.arcsin(min(np.linalg.norm(a - b) / np.sqrt(8), 1)))
 
 
-def test_the_motion_between_two_photographs(photographs, tmp_path):
+def test_the_relative_pose_of_two_photographs(photographs, tmp_path):
     camera = epipole.Camera(*SIZE, MATRIX)
     found = epipole.reconstruct(photographs[0], photographs[1], camera=camera, dense=True)
     (r0, t0), (r1, t1) = list(walk())[:2]
-    # The project's bar for generated pairs.
+    # The target for generated pairs.
     assert angle(found.rotation, r1 @ r0.T) < 0.2
     direction = t1 - r1 @ r0.T @ t0
     assert np.degrees(np.arccos(found.translation @ direction / np.linalg.norm(direction))) < 1
@@ -47,7 +47,7 @@ def test_the_motion_between_two_photographs(photographs, tmp_path):
     assert (tmp_path / "dense.ply").read_bytes().startswith(b"ply\nformat binary")
 
 
-def test_what_two_photographs_cannot_tell(photographs):
+def test_degenerate_pairs_raise_their_exception(photographs):
     with pytest.raises(errors.EpipoleError) as refused:
         epipole.reconstruct(photographs[0], photographs[0], focal=400)
     assert refused.value.kind
@@ -72,11 +72,11 @@ def test_many_photographs(photographs, tmp_path):
     model = found.model
     assert [image.name for image in model.images.values()] == names[:5]
     for image, (r, _), center in zip(model.images.values(), truth, centers):
-        # Half a pixel at a focal length of 400 px; and that over the distance of the walls, 6 m.
+        # Half a pixel at a focal length of 400 px, and the corresponding length at the distance of the walls, 6 m.
         assert angle(image.rotation, r) < 0.07 and np.linalg.norm(image.center - center) < 0.01
     walls = np.min(np.abs(np.c_[model.points[:, 2] - 6, model.points[:, 0] - 3, model.points[:, 1] - 1.4]), axis=1)
     assert np.median(walls) < 0.02 and len(model.points) > 300
-    # The keypoints of a point are where it projects.
+    # The keypoints of a point are at its projections.
     image = model.images[2]
     rows = {int(id): row for row, id in enumerate(model.point_ids)}
     seen = image.point_ids >= 0
@@ -93,13 +93,13 @@ def test_many_photographs(photographs, tmp_path):
     assert upright.frames == ("upright",) and len(upright.model) == 5
 
 
-def test_what_is_told_of_places(photographs, tmp_path):
+def test_positions_and_distances_georeference_the_model(photographs, tmp_path):
     camera = epipole.Camera(*SIZE, MATRIX)
     centers = np.array([-r.T @ t for r, t in walk()])
     between = np.linalg.norm(centers[4] - centers[0])
     found = epipole.sfm(photographs, camera=camera, distances=[(0, 4, 10 * between)])
     first, last = (found.model.images[i].center for i in (1, 5))
-    # The distance alone tells the scale: exact but for rounding.
+    # The distance alone determines the scale: exact up to rounding.
     assert found.frames == ("distances",) and np.linalg.norm(last - first) == pytest.approx(10 * between)
     # A degree of latitude is the meridian's radius times π/180: 110.57 km at the equator, where a degree of longitude is 111.32 km.
     east, north = 6_378_137.0, 6_335_439.3
@@ -111,7 +111,7 @@ def test_what_is_told_of_places(photographs, tmp_path):
     found = epipole.sfm(told, camera=camera)
     assert found.frames == ("gps",)
     size = [np.linalg.norm(image.center - found.model.images[1].center) for image in found.model.images.values()]
-    # As with the centers themselves, above.
+    # As with the centers above.
     assert np.allclose(size, np.linalg.norm(centers - centers[0], axis=1), atol=0.02)
     assert epipole.sfm(told, camera=camera, ignore_gps=True).frames == ("upright",)
     for wrong in ([(0, 0, 1.0)], [(0, 5, 1.0)], [(0, 1, 0.0)], [(0, 1, np.nan)]):
@@ -122,7 +122,7 @@ def test_what_is_told_of_places(photographs, tmp_path):
 
 
 def with_gps(seen, place):
-    """Features as of a photograph whose EXIF tells where it was taken."""
+    """Returns features as of a photograph with a GPS position in EXIF."""
     make, (name, size, (focal, _), *rest) = seen.__reduce__()
     return make(name, size, (focal, place), *rest)
 
@@ -133,11 +133,11 @@ def test_photographs_that_are_left_out_keep_their_names(photographs, tmp_path):
     found = epipole.sfm([*photographs, turned], camera=camera)
     assert found.left_out == {"5": {"kind": "CameraSize", "photo": (300, 400), "camera": SIZE}}
     assert len(found.model.images) == 5
-    # Without a camera of a size it is tried, and shows the same from elsewhere, or not.
+    # Unreadable files are left out by their path.
     bad = [tmp_path / folder / "bad.jpg" for folder in "xy"]
     for path in bad:
         path.parent.mkdir()
-        path.write_bytes(b"no picture")
+        path.write_bytes(b"no image")
     found = epipole.sfm([*photographs, *bad], camera=camera)
     assert list(found.left_out) == [str(path) for path in bad]
     seen = [epipole.sfm_features(photograph, name="one") for photograph in photographs]
@@ -147,7 +147,7 @@ def test_photographs_that_are_left_out_keep_their_names(photographs, tmp_path):
         epipole.sfm(photographs, camera=camera, names=["a", "b", "c", "d", "a"])
 
 
-def test_features_that_were_found_before_give_the_same_model(photographs):
+def test_extracted_features_give_the_same_model(photographs):
     camera = epipole.Camera(*SIZE, MATRIX)
     seen = [epipole.sfm_features(photograph, name=f"{i}") for i, photograph in enumerate(photographs)]
     seen = pickle.loads(pickle.dumps(seen))
@@ -158,7 +158,7 @@ def test_features_that_were_found_before_give_the_same_model(photographs):
         epipole.sfm_features(np.zeros((3, 3), np.uint8))
 
 
-def test_a_model_of_pycolmap_and_back(photographs):
+def test_pycolmap_models_round_trip(photographs):
     pycolmap = pytest.importorskip("pycolmap")
     model = epipole.sfm(photographs, camera=epipole.Camera(*SIZE, MATRIX)).model
     theirs = model.to_pycolmap()
@@ -168,7 +168,7 @@ def test_a_model_of_pycolmap_and_back(photographs):
     assert np.allclose(again.images[1].keypoints, model.images[1].keypoints)
 
 
-def test_photographs_that_give_no_model(photographs, tmp_path):
+def test_photographs_without_a_model_are_errors(photographs, tmp_path):
     gray = np.full((300, 400), 128, np.uint8)
     with pytest.raises(errors.NoPairsError) as refused:
         epipole.sfm([gray, gray])
@@ -184,7 +184,7 @@ def test_photographs_that_give_no_model(photographs, tmp_path):
         model.write(tmp_path / "m")
 
 
-def test_the_pose_of_a_photograph_of_known_points():
+def test_the_absolute_pose_from_known_points():
     random = np.random.default_rng(7)
     points = random.uniform([-2, -1, 3], [2, 1, 8], (120, 3))
     r, t = scenes.rotation(0.1, -0.3, 0.05), np.array([0.3, -0.1, 0.4])
@@ -193,7 +193,7 @@ def test_the_pose_of_a_photograph_of_known_points():
     wrong = np.arange(120) % 3 == 0
     pixels[wrong] += random.uniform(30, 60, (wrong.sum(), 2))
     found = epipole.estimate_pose(points, pixels, camera)
-    # Exact but for rounding.
+    # Exact up to rounding.
     assert angle(found.rotation, r) < 1e-6 and np.allclose(found.translation, t, atol=1e-7)
     assert np.array_equal(found.inliers, ~wrong) and np.allclose(found.center, -r.T @ t, atol=1e-7)
     with pytest.raises(errors.NotEnoughMatchesError) as refused:
@@ -203,12 +203,12 @@ def test_the_pose_of_a_photograph_of_known_points():
         epipole.estimate_pose(points, pixels[:5], camera)
 
 
-def test_features_are_matched_as_photographs_are(photographs):
+def test_matching_features_equals_matching_photographs(photographs):
     a, b = (epipole.extract_features(photograph) for photograph in photographs[:2])
     found = epipole.match(a, b)
     assert np.array_equal(found.points, epipole.match_features(*photographs[:2], affine_simulation="never").points)
     theirs = [epipole.Features(f.keypoints, f.descriptors) for f in (a, b)]
-    # As another program's, of which less is known.
+    # Features of another program, of unknown descriptor kind.
     assert len(epipole.match(*theirs)) > 0.5 * len(found)
     with pytest.raises(errors.EpipoleError):
         epipole.match(a, theirs[1])

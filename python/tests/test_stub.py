@@ -1,4 +1,4 @@
-"""What editors are told of the functions is what the functions take."""
+"""The signatures of the stub are those of the functions."""
 
 import ast
 from pathlib import Path
@@ -10,7 +10,7 @@ STUB = ast.parse((Path(epipole.__file__).parent / "_native.pyi").read_text())
 
 
 def options(function):
-    """Keyword-only arguments of the stub, and their defaults."""
+    """Returns the keyword-only arguments of the stub and their defaults."""
     for node in STUB.body:
         if isinstance(node, ast.ClassDef) and node.name == function:
             node = next(n for n in node.body if getattr(n, "name", "") == "__new__")
@@ -48,12 +48,12 @@ def test_options_and_defaults_of_the_stub(function):
     assert options(function) == pytest.approx(epipole.defaults(function))
 
 
-def test_the_stub_names_what_there_is():
+def test_the_stub_has_all_public_names():
     there = {node.name for node in STUB.body if isinstance(node, (ast.ClassDef, ast.FunctionDef))}
     there = {name for name in there if not name.startswith("_")}
     own = {"AprilGrid", "ArucoGrid", "CharucoBoard", "Chessboard", "ColorModel", "Features", "PointCloud", "Reconstruction"}
     public = {name for name in epipole.__all__ if name not in ("errors", "boards", "__version__")}
-    # What is behind classes of Python.
+    # Internal classes and functions of the Python wrappers.
     assert there - {"FittedColorModel", "read_model", "write_model"} == public - own
     for name in epipole.__all__:
         assert hasattr(epipole, name)

@@ -1,42 +1,42 @@
-//! Figures held against bars: what `cargo xtask real` and `cargo xtask peers` have in common.
+//! Figures compared with targets: shared by `cargo xtask real`, `rendered`, `golden` and `peers`.
 
 use anyhow::{Result, bail};
 use std::time::Instant;
 
-/// A figure and the bar it is held against.
+/// A figure and its target.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Check {
-    /// What was measured, with its unit.
+    /// The quantity, with its unit.
     pub(crate) name: String,
-    /// What came out.
+    /// The measured value.
     pub(crate) figure: f64,
-    /// What is asked for, with its direction: `<= 2.2`.
-    pub(crate) bar: String,
-    /// Whether the figure meets the bar.
+    /// The limit, with its direction: `<= 2.2`.
+    pub(crate) target: String,
+    /// Whether the figure meets the target.
     pub(crate) ok: bool,
 }
 
 impl Check {
-    /// A figure that must not be larger than `bar`. NaN fails.
-    pub(crate) fn at_most(name: impl Into<String>, figure: f64, bar: f64) -> Self {
-        Self { name: name.into(), figure, bar: format!("<= {}", rounded(bar)), ok: figure <= bar }
+    /// A figure that must not be larger than `limit`. NaN fails.
+    pub(crate) fn at_most(name: impl Into<String>, figure: f64, limit: f64) -> Self {
+        Self { name: name.into(), figure, target: format!("<= {}", rounded(limit)), ok: figure <= limit }
     }
 
-    /// A figure that must not be smaller than `bar`. NaN fails.
-    pub(crate) fn at_least(name: impl Into<String>, figure: f64, bar: f64) -> Self {
-        Self { name: name.into(), figure, bar: format!(">= {}", rounded(bar)), ok: figure >= bar }
+    /// A figure that must not be smaller than `limit`. NaN fails.
+    pub(crate) fn at_least(name: impl Into<String>, figure: f64, limit: f64) -> Self {
+        Self { name: name.into(), figure, target: format!(">= {}", rounded(limit)), ok: figure >= limit }
     }
 }
 
-/// To three decimals, without zeros at the end.
-fn rounded(bar: f64) -> f64 {
-    (1e3 * bar).round() / 1e3
+/// Rounds to three decimals.
+fn rounded(limit: f64) -> f64 {
+    (1e3 * limit).round() / 1e3
 }
 
-/// A job by its name on the command line.
+/// A job and its name on the command line.
 pub(crate) type Named<J> = (&'static str, J);
 
-/// All jobs, or the one named; `all` names all of them, too.
+/// Returns the job of that name; all jobs for `None` or `all`.
 pub(crate) fn select<'a, J>(jobs: &'a [Named<J>], only: Option<&str>) -> Result<Vec<&'a Named<J>>> {
     let chosen: Vec<_> =
         jobs.iter().filter(|(name, _)| only.is_none_or(|only| only == *name || only == "all")).collect();
@@ -47,8 +47,8 @@ pub(crate) fn select<'a, J>(jobs: &'a [Named<J>], only: Option<&str>) -> Result<
     Ok(chosen)
 }
 
-/// Runs jobs one after the other and prints every figure beside its bar at the end; true where all are met. A job that
-/// fails does not keep the others from running.
+/// Runs jobs one after the other and prints a table of all figures and targets at the end; true if all are met. The run
+/// continues after a job that fails.
 pub(crate) fn run<J>(jobs: &[&Named<J>], call: impl Fn(&J) -> Result<Vec<Check>>) -> bool {
     let mut ok = true;
     let mut table = Vec::new();
@@ -57,7 +57,7 @@ pub(crate) fn run<J>(jobs: &[&Named<J>], call: impl Fn(&J) -> Result<Vec<Check>>
         let start = Instant::now();
         match call(job) {
             Ok(checks) => {
-                // A job that measures nothing has not passed.
+                // A job without figures has not passed.
                 ok &= !checks.is_empty() && checks.iter().all(|check| check.ok);
                 table.extend(checks.into_iter().map(|check| (*name, check)));
             }
@@ -72,15 +72,15 @@ pub(crate) fn run<J>(jobs: &[&Named<J>], call: impl Fn(&J) -> Result<Vec<Check>>
     ok
 }
 
-/// The table at the end of a run.
+/// Returns the table of figures and targets.
 fn render(table: &[(&str, Check)]) -> String {
     let width = table.iter().map(|(job, check)| job.len() + 1 + check.name.len()).max().unwrap_or(0);
     table
         .iter()
         .map(|(job, check)| {
-            let verdict = if check.ok { "ok" } else { "OFF THE BAR" };
+            let verdict = if check.ok { "ok" } else { "NOT MET" };
             let name = format!("{job} {}", check.name);
-            format!("{name:width$}  {:>10.4}  {:>10}  {verdict}\n", check.figure, check.bar)
+            format!("{name:width$}  {:>10.4}  {:>10}  {verdict}\n", check.figure, check.target)
         })
         .collect()
 }
@@ -90,18 +90,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_figure_that_is_no_number_meets_no_bar() {
+    fn nan_meets_no_target() {
         assert!(!Check::at_most("x", f64::NAN, 1.0).ok && !Check::at_least("x", f64::NAN, 1.0).ok);
         assert!(Check::at_most("x", 1.0, 1.0).ok && !Check::at_most("x", 1.1, 1.0).ok);
         assert!(Check::at_least("x", 1.0, 1.0).ok && !Check::at_least("x", 0.9, 1.0).ok);
     }
 
     #[test]
-    fn the_table_says_which_figure_is_off() {
+    fn the_table_marks_figures_that_do_not_meet_their_target() {
         let table = [("depth", Check::at_most("a", 2.0, 1.0)), ("segment", Check::at_least("long name", 2.0, 1.0))];
         let text = render(&table);
         let lines: Vec<&str> = text.lines().collect();
-        assert!(lines[0].ends_with("OFF THE BAR") && lines[1].ends_with("ok"));
+        assert!(lines[0].ends_with("NOT MET") && lines[1].ends_with("ok"));
         assert_eq!(lines[0].find("<="), lines[1].find(">="));
     }
 

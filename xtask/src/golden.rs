@@ -1,9 +1,8 @@
 //! `cargo xtask golden`: every pipeline on the small inputs under `fixtures/`.
 //!
-//! Two questions are asked of each figure that comes out. Is it right: does it meet a bar against `fixtures/oracle`, the
-//! analytic truth? And has it changed: is it within its tolerance of `fixtures/golden`, what came out before? The second
-//! only says that something is different, never that it is good. `--check`, which the tests run, writes nothing; without it
-//! the golden figures are rewritten and every change is shown.
+//! Each figure is checked twice. Accuracy: it meets its target against `fixtures/oracle`, the analytic ground truth. Regression:
+//! it is within its tolerance of `fixtures/golden`, the figures of an earlier run; this detects a change, not an error. `--check`,
+//! which the tests run, writes nothing; without it the golden figures are rewritten and every change is printed.
 
 mod jobs;
 
@@ -12,7 +11,7 @@ use anyhow::{Context, Result};
 use serde_json::{Map, Value, json};
 use std::path::{Path, PathBuf};
 
-/// A figure, and by how much it may differ from the golden one before that counts as a change.
+/// A figure and the largest difference from the golden one that does not count as a change.
 #[derive(Debug, Clone)]
 struct Figure {
     name: &'static str,
@@ -20,18 +19,18 @@ struct Figure {
     tolerance: f64,
 }
 
-/// What a pipeline made of its fixtures.
+/// Results of a pipeline on its fixtures.
 struct Outcome {
-    /// Held against the truth.
+    /// Compared with the ground truth.
     checks: Vec<Check>,
-    /// Held against the past.
+    /// Compared with the golden figures.
     figures: Vec<Figure>,
 }
 
-/// A job: its name, which is that of its golden file, and what it does with the fixtures.
+/// A job: its name, which is that of its golden file, and its function of the fixtures' folder.
 type Job = (&'static str, fn(&Path) -> Result<Outcome>);
 
-/// Runs all jobs. With `check`, true where every figure is right and unchanged; without it, rewrites the golden files.
+/// Runs all jobs. With `check`, returns whether every figure meets its target and is unchanged; without it, rewrites the golden files.
 pub(crate) fn run(check: bool) -> Result<bool> {
     run_in(&crate::root().join("fixtures"), jobs::JOBS, check)
 }
@@ -40,10 +39,10 @@ fn run_in(fixtures: &Path, jobs: &[Job], check: bool) -> Result<bool> {
     let mut ok = true;
     for (name, job) in jobs {
         let outcome = job(fixtures).with_context(|| (*name).to_owned())?;
-        for Check { name: what, figure, bar, ok: right, .. } in &outcome.checks {
-            let verdict = if *right { "ok" } else { "WRONG" };
-            println!("{name}: {what} {figure:.4} {bar}: {verdict}");
-            ok &= right;
+        for Check { name: quantity, figure, target, ok: is_met, .. } in &outcome.checks {
+            let verdict = if *is_met { "ok" } else { "NOT MET" };
+            println!("{name}: {quantity} {figure:.4} {target}: {verdict}");
+            ok &= is_met;
         }
         let path = fixtures.join("golden").join(format!("{name}.json"));
         let changes = compare(&path, &outcome.figures)?;
@@ -57,12 +56,12 @@ fn run_in(fixtures: &Path, jobs: &[Job], check: bool) -> Result<bool> {
         }
     }
     if !ok && check {
-        println!("golden: where a change is meant and right, run `cargo xtask golden` and commit what it writes");
+        println!("golden: if a change is intended and correct, run `cargo xtask golden` and commit the files");
     }
     Ok(ok)
 }
 
-/// What is not as it was.
+/// Lists the differences from the golden figures.
 fn compare(path: &PathBuf, figures: &[Figure]) -> Result<Vec<String>> {
     let golden: Map<String, Value> = match std::fs::read_to_string(path) {
         Ok(text) => serde_json::from_str(&text).with_context(|| path.display().to_string())?,
@@ -72,13 +71,13 @@ fn compare(path: &PathBuf, figures: &[Figure]) -> Result<Vec<String>> {
     for Figure { name, value, tolerance } in figures {
         match golden.get(*name).and_then(Value::as_f64) {
             None => changes.push(format!("{name} is new: {value}")),
-            // NaN is a change.
+            // The comparison is false for NaN, which counts as a change.
             Some(old) if (value - old).abs() <= *tolerance => {}
             Some(old) => changes.push(format!("{name} was {old}, is {value} (tolerance {tolerance})")),
         }
     }
-    for gone in golden.keys().filter(|key| !figures.iter().any(|figure| figure.name == key.as_str())) {
-        changes.push(format!("{gone} is gone"));
+    for missing in golden.keys().filter(|key| !figures.iter().any(|figure| figure.name == key.as_str())) {
+        changes.push(format!("{missing} is missing"));
     }
     Ok(changes)
 }
@@ -97,7 +96,7 @@ mod tests {
     use std::fs;
 
     #[test]
-    fn the_pipelines_are_right_and_as_they_were() {
+    fn the_pipelines_meet_their_targets_and_match_the_golden_figures() {
         assert!(run(true).unwrap());
     }
 
@@ -106,12 +105,12 @@ mod tests {
         Ok(Outcome { checks: vec![Check::at_most("x", 1.0, 2.0)], figures: vec![figure("a", 1.0), figure("b", 2.0)] })
     }
 
-    fn wrong(_: &Path) -> Result<Outcome> {
+    fn failing(_: &Path) -> Result<Outcome> {
         Ok(Outcome { checks: vec![Check::at_most("x", f64::NAN, 2.0)], figures: Vec::new() })
     }
 
     #[test]
-    fn a_check_never_writes_and_sees_each_kind_of_change() {
+    fn a_check_writes_nothing_and_detects_each_kind_of_change() {
         let folder = tempfile::tempdir().unwrap();
         let (path, jobs) = (folder.path().join("golden/two.json"), [("two", two as fn(&Path) -> Result<Outcome>)]);
         assert!(!run_in(folder.path(), &jobs, true).unwrap() && !path.exists());
@@ -130,8 +129,8 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_figure_cannot_be_made_golden() {
+    fn a_figure_that_does_not_meet_its_target_fails_the_rewrite_too() {
         let folder = tempfile::tempdir().unwrap();
-        assert!(!run_in(folder.path(), &[("wrong", wrong as fn(&Path) -> Result<Outcome>)], false).unwrap());
+        assert!(!run_in(folder.path(), &[("failing", failing as fn(&Path) -> Result<Outcome>)], false).unwrap());
     }
 }

@@ -30,18 +30,18 @@ enum Chore {
     Fixtures,
     /// Check the rules of the workspace that no compiler checks.
     Tidy,
-    /// Run the pipelines on fixtures/, hold them against the truth and against what they gave before.
+    /// Run the pipelines on fixtures/; compare with the ground truth and the golden figures.
     Golden {
-        /// Write nothing; fail where something changed.
+        /// Write nothing; fail if a figure changed.
         #[arg(long)]
         check: bool,
     },
-    /// Run the pipelines on real photographs with known truth and hold each figure against its bar.
+    /// Run the pipelines on real photographs with ground truth; compare each figure with its target.
     Real {
         /// Only this job; `all` or none: every one.
         job: Option<String>,
     },
-    /// Run many views on rendered photographs with exact truth and hold each figure against its bar.
+    /// Run structure from motion on rendered photographs with exact poses; compare each figure with its target.
     Rendered {
         /// Only this job; `all` or none: every one.
         job: Option<String>,
@@ -50,20 +50,20 @@ enum Chore {
     Trust {
         /// Only this job; `all` or none: every one.
         job: Option<String>,
-        /// How many runs [default: 10000 damaged inputs, 200 kills].
+        /// Number of runs [default: 10000 damaged inputs, 200 kills].
         #[arg(long)]
         count: Option<u64>,
-        /// Of the random choices.
+        /// Seed of the random choices.
         #[arg(long, default_value_t = 1)]
         seed: u64,
     },
     /// Build the wheel of the Python package, install it into a virtual environment and run its tests.
     Python {
-        /// As it is released: optimized, and on Linux for every one from glibc 2.17 on, by zig from PyPI.
+        /// Build the release wheel: optimized, and on Linux for glibc 2.17 or later by zig from PyPI.
         #[arg(long)]
         release: bool,
     },
-    /// Run other systems and ours on the same inputs, side by side.
+    /// Benchmark other systems and ours on the same inputs.
     Peers {
         /// Only this job; `all` or none: every one.
         job: Option<String>,
@@ -91,12 +91,12 @@ fn main() -> ExitCode {
     }
 }
 
-/// The root of the workspace.
+/// Returns the root of the workspace.
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new("."))
 }
 
-/// The folder with the real data: `CV_DATA_DIR`, else `../shared/data` beside the workspace, where it is there.
+/// Returns the folder with the real data if it exists: `CV_DATA_DIR`, else `../shared/data` beside the workspace.
 fn data_dir() -> Option<PathBuf> {
     let folder = match std::env::var_os("CV_DATA_DIR") {
         Some(folder) => PathBuf::from(folder),
@@ -105,13 +105,13 @@ fn data_dir() -> Option<PathBuf> {
     folder.is_dir().then_some(folder)
 }
 
-/// The folder that the build goes into.
+/// Returns cargo's target folder.
 fn target_dir() -> anyhow::Result<PathBuf> {
     let program = std::env::current_exe()?;
-    Ok(program.ancestors().nth(2).context("the program lies in no target folder")?.to_owned())
+    Ok(program.ancestors().nth(2).context("the program is not in a target folder")?.to_owned())
 }
 
-/// Our program as it is given away, built where it is not.
+/// Builds our program with the release profile, unless it is up to date, and returns its path.
 fn release_program() -> anyhow::Result<PathBuf> {
     let target = target_dir()?;
     peers::check(

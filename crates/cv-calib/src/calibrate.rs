@@ -87,7 +87,7 @@ pub fn calibrate(
     let mut calibration =
         report(&renumbered, options, fit, holdout, monos.into_iter().map(|a| a.0).collect(), &rejections)?;
     for (view, symmetries) in calibration.views.iter_mut().zip(numberings) {
-        view.images.iter_mut().zip(symmetries).for_each(|(picture, symmetry)| picture.symmetry = symmetry);
+        view.images.iter_mut().zip(symmetries).for_each(|(image, symmetry)| image.symmetry = symmetry);
     }
     Ok(calibration)
 }
@@ -144,8 +144,8 @@ fn too_few_views(rejections: &[Vec<Option<ImageOutcome>>], camera: usize, got: u
 
 /// Returns the mask of the corners in images that are not rejected.
 fn usable_corners(data: &TargetObservations, rejections: &[Vec<Option<ImageOutcome>>]) -> InlierMask {
-    let picture = |(corners, rejections): (&Vec<_>, &Option<_>)| vec![rejections.is_none(); corners.len()];
-    data.views.iter().zip(rejections).map(|(v, r)| v.iter().zip(r).map(picture).collect()).collect()
+    let image_mask = |(corners, rejections): (&Vec<_>, &Option<_>)| vec![rejections.is_none(); corners.len()];
+    data.views.iter().zip(rejections).map(|(v, r)| v.iter().zip(r).map(image_mask).collect()).collect()
 }
 
 /// Computes the covariance of all parameters but the target poses, and the noise variance of a coordinate.
@@ -302,7 +302,7 @@ fn assemble_view(
     rejections: &[Vec<Option<ImageOutcome>>],
     limit_px: f64,
 ) -> CalibratedView {
-    let picture = |c: usize| {
+    let assemble_image = |c: usize| {
         let residuals = fit.estimate.residuals(data, v, c);
         let used = &fit.used[v][c];
         let count = used.iter().filter(|u| **u).count();
@@ -322,7 +322,7 @@ fn assemble_view(
         let rms_px = if n == 0 { f64::NAN } else { (squares / f64::from(n)).sqrt() };
         CalibratedImage { outcome, rms_px, corners, symmetry: 0 }
     };
-    let images: Vec<CalibratedImage> = (0..data.sizes.len()).map(picture).collect();
+    let images: Vec<CalibratedImage> = (0..data.sizes.len()).map(assemble_image).collect();
     let is_used = images.iter().any(|p| p.outcome.is_used());
     CalibratedView { pose: fit.estimate.poses[v].filter(|_| is_used), images }
 }
@@ -361,7 +361,7 @@ fn capture_notes(data: &TargetObservations, calibration: &Calibration) -> Vec<Ca
         }
         let observed = images().filter(|p| p.outcome != ImageOutcome::Nothing).count();
         if 5 * (observed - got) > observed {
-            notes.push(CaptureNote::LeftOut { camera, pictures: observed - got, of: observed });
+            notes.push(CaptureNote::LeftOut { camera, images: observed - got, of: observed });
         }
         let all = [0.0, 1.0];
         let sides = [

@@ -69,13 +69,13 @@ fn robust_sigma(residuals: &Residuals, of: &InlierMask) -> f64 {
 /// Returns the usable corners within `max_error` pixels. Images are rejected that have fewer than half of their corners
 /// left, or fewer than `min_corners`.
 fn select_inliers(residuals: &Residuals, usable: &InlierMask, max_error: f64, min_corners: usize) -> InlierMask {
-    let picture = |(residuals, usable): (&Vec<Option<Vector2<f64>>>, &Vec<bool>)| {
+    let select_in_image = |(residuals, usable): (&Vec<Option<Vector2<f64>>>, &Vec<bool>)| {
         let is_inlier = |(r, of): (&Option<Vector2<f64>>, &bool)| *of && r.is_some_and(|r| r.norm() <= max_error);
         let inliers: Vec<bool> = residuals.iter().zip(usable).map(is_inlier).collect();
         let (count, all) = (inliers.iter().filter(|k| **k).count(), usable.iter().filter(|k| **k).count());
         if 2 * count < all || count < min_corners { vec![false; inliers.len()] } else { inliers }
     };
-    residuals.iter().zip(usable).map(|(r, o)| r.iter().zip(o).map(picture).collect()).collect()
+    residuals.iter().zip(usable).map(|(r, o)| r.iter().zip(o).map(select_in_image).collect()).collect()
 }
 
 /// Fits all free parameters: first with the Cauchy loss, then by least squares on the inliers, until these no longer

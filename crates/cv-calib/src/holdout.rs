@@ -9,8 +9,8 @@ use cv_numeric::RobustLoss;
 /// Sums of squared errors on held-out views.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct HoldOut {
-    /// By view and camera: sum of squared errors in square pixels, and number of corners.
-    pub(crate) pictures: Vec<Vec<(f64, usize)>>,
+    /// Sum of squared errors over the inliers in square pixels, and number of corners, by view and camera.
+    pub(crate) inliers: Vec<Vec<(f64, usize)>>,
     /// The same over all usable corners of these views, outliers included, with poses fitted to all of them.
     pub(crate) all: Vec<Vec<(f64, usize)>>,
 }
@@ -18,7 +18,7 @@ pub(crate) struct HoldOut {
 impl HoldOut {
     /// Returns the root mean square error over the corners of one camera, or of all cameras.
     pub(crate) fn rms(&self, camera: Option<usize>) -> f64 {
-        Self::rms_of(&self.pictures, camera)
+        Self::rms_of(&self.inliers, camera)
     }
 
     /// As [`HoldOut::rms`], over all corners, outliers included.
@@ -26,12 +26,12 @@ impl HoldOut {
         Self::rms_of(&self.all, camera)
     }
 
-    fn rms_of(pictures: &[Vec<(f64, usize)>], camera: Option<usize>) -> f64 {
+    fn rms_of(images: &[Vec<(f64, usize)>], camera: Option<usize>) -> f64 {
         let of = |v: &Vec<(f64, usize)>| match camera {
             Some(c) => v.get(c).copied().unwrap_or_default(),
             None => v.iter().fold((0.0, 0), |s, p| (s.0 + p.0, s.1 + p.1)),
         };
-        let (squares, count) = pictures.iter().map(of).fold((0.0, 0), |s, p| (s.0 + p.0, s.1 + p.1));
+        let (squares, count) = images.iter().map(of).fold((0.0, 0), |s, p| (s.0 + p.0, s.1 + p.1));
         (squares / count.max(1) as f64).sqrt()
     }
 }
@@ -55,7 +55,7 @@ pub(crate) fn hold_out(
     let select =
         |used: &InlierMask, views: &[usize]| -> InlierMask { views.iter().map(|v| used[*v].clone()).collect() };
     let zeros = || vec![vec![(0.0, 0); data.sizes.len()]; data.views.len()];
-    let mut out = HoldOut { pictures: zeros(), all: zeros() };
+    let mut out = HoldOut { inliers: zeros(), all: zeros() };
     for fold in 0..folds {
         let (mut train, mut test) = (Vec::new(), Vec::new());
         for (i, v) in views.iter().enumerate() {
@@ -65,7 +65,7 @@ pub(crate) fn hold_out(
             fit(&data.subset(&train), &fit_of_all.estimate.subset(&train), &select(usable, &train), limits, progress)?;
         let mut held_out = Estimate { poses: fit_of_all.estimate.subset(&test).poses, ..fitted.estimate };
         let test_data = data.subset(&test);
-        for (corners, sums) in [(scored, &mut out.pictures), (usable, &mut out.all)] {
+        for (corners, sums) in [(scored, &mut out.inliers), (usable, &mut out.all)] {
             let corners = select(corners, &test);
             adjust(
                 &test_data,

@@ -249,7 +249,7 @@ fn select_model(errors: &[(usize, HoldOut)], fits: &[(usize, Fit)], trials: &mut
         return 0;
     };
     let is_as_accurate = |error: &HoldOut| {
-        let views = error.pictures.iter().flatten().zip(smallest.pictures.iter().flatten());
+        let views = error.inliers.iter().flatten().zip(smallest.inliers.iter().flatten());
         let differences: Vec<f64> = views.filter(|(e, _)| e.1 > 0).map(|(e, l)| e.0 - l.0).collect();
         let n = differences.len() as f64;
         let mean = differences.iter().sum::<f64>() / n;

@@ -50,13 +50,13 @@ fn sample_corners(corners: &[TargetCorner]) -> Vec<TargetCorner> {
 
 /// Returns a mask with at most [`SAMPLED_CORNERS`] corners of each image.
 pub(crate) fn sample_mask(used: &InlierMask) -> InlierMask {
-    let picture = |used: &Vec<bool>| {
+    let sample_image = |used: &Vec<bool>| {
         let set_indices: Vec<usize> = (0..used.len()).filter(|i| used[*i]).collect();
         let mut out = vec![false; used.len()];
         sample_indices(set_indices.len()).into_iter().for_each(|i| out[set_indices[i]] = true);
         out
     };
-    used.iter().map(|cameras| cameras.iter().map(picture).collect()).collect()
+    used.iter().map(|cameras| cameras.iter().map(sample_image).collect()).collect()
 }
 
 /// Returns the median reprojection error of sampled corners for each camera, with target poses from homographies;

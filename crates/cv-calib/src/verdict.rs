@@ -77,7 +77,8 @@ pub enum CaptureNote {
         /// Index of the camera.
         camera: usize,
         /// Images rejected.
-        pictures: usize,
+        #[cfg_attr(feature = "serde", serde(rename = "pictures"))]
+        images: usize,
         /// Images with corners.
         of: usize,
     },
@@ -149,7 +150,7 @@ impl Verdict {
             CaptureNote::ParallelTargets { spread_degrees, .. } => spread_degrees < PARALLEL_DEGREES / 2.0,
             CaptureNote::Uncertain { median_px, .. } => median_px.is_nan() || median_px > UNCERTAIN_PX[1],
             CaptureNote::HoldOut { rms_px, holdout_rms_px, .. } => holdout_rms_px > HOLDOUT_RATIO[1] * rms_px,
-            CaptureNote::LeftOut { pictures, of, .. } => 2 * pictures > of,
+            CaptureNote::LeftOut { images, of, .. } => 2 * images > of,
             CaptureNote::FewShared { got, .. } => got < 3,
             CaptureNote::EmptySide { .. } => false,
             CaptureNote::BentTarget { .. } => return Trust::Good,

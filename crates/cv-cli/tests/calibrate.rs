@@ -1,4 +1,4 @@
-//! `cv calibrate`, `cv undistort` and `cv calibration` from outside. What they do when all is well the guides show.
+//! `cv calibrate`, `cv undistort` and `cv calibration` as a black box. The guides test their ordinary use.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -9,7 +9,7 @@ use std::fs;
 use support::{json, refused, run};
 
 #[test]
-fn what_is_no_board_is_said_to_be_none_and_nothing_is_written() {
+fn photographs_without_a_board_are_refused_and_nothing_is_written() {
     let folder = tempfile::tempdir().unwrap();
     let gray = GrayU8::new(160, 120, [90]);
     for name in ["a1.png", "a2.png", "b1.png"] {
@@ -20,7 +20,7 @@ fn what_is_no_board_is_said_to_be_none_and_nothing_is_written() {
     let stereo = ["calibrate", "stereo", "--left", "a1.png", "a2.png", "--right", "b1.png", "-o", "out/rig.yaml"];
     assert!(refused(folder.path(), &stereo).stderr.contains("no board"));
     assert!(!folder.path().join("out").exists());
-    fs::write(folder.path().join("bad.png"), "no picture").unwrap();
+    fs::write(folder.path().join("bad.png"), "no image").unwrap();
     let bad = refused(folder.path(), &["calibrate", "mono", "a1.png", "bad.png", "-o", "cam.yaml"]);
     assert!(bad.stderr.contains("bad.png"), "{}", bad.stderr);
     for wrong in [["--board", "9"], ["--board", "2x2"], ["--square", "-1"], ["--lens", "round"], ["--outliers", "1"]] {
@@ -30,7 +30,7 @@ fn what_is_no_board_is_said_to_be_none_and_nothing_is_written() {
 }
 
 #[test]
-fn a_camera_goes_through_every_format_and_takes_the_lens_out() {
+fn a_camera_round_trips_through_every_format_and_undistorts() {
     let folder = tempfile::tempdir().unwrap();
     let camera = "schema: cv-camera/1\nwidth: 160\nheight: 120\nfx: 130.25\nfy: 131\ncx: 80\ncy: 59.5\n\
                   distortion: radial_tangential4\ncoefficients: [-0.2, 0.05, 0.001, -0.002]\n";
@@ -56,16 +56,16 @@ fn a_camera_goes_through_every_format_and_takes_the_lens_out() {
         json(folder.path(), &["undistort", "photo.png", "--camera", "cam.yaml", "-o", "straight", "--alpha", "0"]);
     assert_eq!(done["width"], 160);
     let straight = cv_io::read_rgb(folder.path().join("straight/photo.png")).unwrap();
-    // Every pixel shows something: blue is the same everywhere, and black where the lens does not reach.
+    // A constant image: blue is the same at every pixel, and black where the lens has no ray.
     assert!(straight.size() == (160, 120) && straight.as_slice().chunks(3).all(|p| p[2].abs_diff(128) <= 1));
-    // Its camera has no lens to take out.
+    // The undistorted camera has no distortion.
     assert_eq!(shown("straight/camera.yaml")["lens"], "none");
     let again = run(folder.path(), &["undistort", "photo.png", "--camera", "cam.yaml", "-o", "."]);
     assert_eq!(again.code, Some(1), "{}", again.stderr);
 }
 
 #[test]
-fn boards_are_drawn_the_same_each_time_in_every_format() {
+fn boards_are_drawn_deterministically_in_every_format() {
     let folder = tempfile::tempdir().unwrap();
     let draw = |file: &str, more: &[&str]| {
         let args = [&["board", "-o", file, "--board", "9x6", "--square", "20"], more].concat();
@@ -77,7 +77,7 @@ fn boards_are_drawn_the_same_each_time_in_every_format() {
         let first = draw(file, &[]);
         assert!(first.starts_with(begins) && first == draw(file, &[]), "{file}");
     }
-    // Its resolution: 11811 dots to the meter both ways, and that the unit is the meter.
+    // The pHYs chunk: 11811 dots per meter in both directions.
     let png = draw("a.png", &["--paper", "letter"]);
     let at = png.windows(4).position(|w| w == b"pHYs").unwrap();
     assert_eq!(png[at + 4..at + 13], [0, 0, 0x2e, 0x23, 0, 0, 0x2e, 0x23, 1]);
@@ -91,12 +91,12 @@ fn boards_are_drawn_the_same_each_time_in_every_format() {
 }
 
 #[test]
-fn a_sheet_that_was_drawn_is_no_rig_and_one_camera_none_either() {
+fn a_board_sheet_or_a_single_camera_is_refused_as_a_rig() {
     let folder = tempfile::tempdir().unwrap();
     let board = ["--kind", "aprilgrid", "--board", "3x2", "--marker", "40"];
     support::done(folder.path(), &[&["board", "-o", "1.png", "--dpi", "60"], &board[..]].concat());
     let rig = [&["calibrate", "rig", "-o", "rig.yaml", "--cameras", "1.png", "1.png", "1.png"], &board[..]].concat();
-    // It is found on all three, and one view is too few.
+    // The board is detected in all three photographs, and the single view is too few.
     let said = refused(folder.path(), &rig).stderr;
     assert!(said.contains("on 1 photograph, 3 are needed"), "{said}");
     let one = [&["calibrate", "rig", "-o", "rig.yaml", "--cameras", "1.png"], &board[..]].concat();

@@ -1,4 +1,4 @@
-//! Sets of photographs that `cv calibrate` can make little of, and files that are none, from outside: each is refused for its own reason, and nothing is written.
+//! Degenerate sets of photographs for `cv calibrate` and malformed calibration files, as a black box: each is refused for its own reason, and nothing is written.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -9,19 +9,19 @@ use std::fs;
 use std::path::Path;
 use support::{done, json, refused};
 
-/// A board of markers as its sheet shows it.
+/// Options of the marker board of most tests.
 const BOARD: [&str; 8] = ["--kind", "aruco-grid", "--board", "3x2", "--marker", "30", "--dictionary", "4x4_50"];
 
-/// The sheet of a board, at 60 pixels to an inch.
+/// Renders the sheet of a board at 60 pixels per inch.
 fn sheet(folder: &Path, board: &[&str]) -> GrayU8 {
     done(folder, &[&["board", "-o", "sheet.png", "--dpi", "60"], board].concat());
     cv_io::read_gray_u8(folder.join("sheet.png")).unwrap()
 }
 
-/// What is said of three photographs that are all this picture.
-fn said_of(folder: &Path, picture: &GrayU8, board: &[&str]) -> String {
+/// Returns the messages of a calibration from three copies of an image.
+fn messages_for(folder: &Path, image: &GrayU8, board: &[&str]) -> String {
     for name in ["a.png", "b.png", "c.png"] {
-        cv_io::write_png(folder.join(name), picture.view()).unwrap();
+        cv_io::write_png(folder.join(name), image.view()).unwrap();
     }
     let arguments = [&["calibrate", "mono"], board, &["a.png", "b.png", "c.png", "-o", "camera.yaml"]].concat();
     let said = refused(folder, &arguments).stderr;
@@ -50,21 +50,21 @@ fn one_view_and_photographs_of_different_sizes_are_too_few() {
 }
 
 #[test]
-fn mirrored_boards_two_at_once_and_the_dark_are_told_apart() {
+fn mirrored_boards_two_boards_and_dark_images_are_reported_differently() {
     let folder = tempfile::tempdir().unwrap();
     let photo = sheet(folder.path(), &BOARD);
     let (width, height) = photo.size();
     let mirrored = GrayU8::from_fn(width, height, |x, y| photo.at(width - 1 - x, y));
-    let said = said_of(folder.path(), &mirrored, &BOARD);
+    let said = messages_for(folder.path(), &mirrored, &BOARD);
     assert!(said.contains("6 markers of 4x4_50, mirrored"), "{said}");
     let twice = GrayU8::from_fn(2 * width, height, |x, y| photo.at(x % width, y));
-    let said = said_of(folder.path(), &twice, &BOARD);
+    let said = messages_for(folder.path(), &twice, &BOARD);
     assert!(said.contains("detected the board 2 times"), "{said}");
-    // A lens cap with a little light: white is at 4 of 255.
+    // A dark image: white has level 4 of 255.
     let dark = photo.map(|[v]| [v / 60]);
-    let said = said_of(folder.path(), &dark, &BOARD);
+    let said = messages_for(folder.path(), &dark, &BOARD);
     assert!(said.contains("no board was detected on any of 3 photographs"), "{said}");
-    let said = said_of(
+    let said = messages_for(
         folder.path(),
         &sheet(folder.path(), &["--board", "9x6", "--square", "20"]).map(|[v]| [v / 60]),
         &["--board", "9x6"],
@@ -73,12 +73,12 @@ fn mirrored_boards_two_at_once_and_the_dark_are_told_apart() {
 }
 
 #[test]
-fn boards_that_look_the_same_after_half_a_turn_are_found_as_they_are() {
+fn boards_with_a_rotational_symmetry_of_180_degrees_are_detected() {
     let folder = tempfile::tempdir().unwrap();
     for size in ["8x6", "7x7"] {
         let photo = sheet(folder.path(), &["--board", size, "--square", "20"]);
-        // Found in each, and seen from straight ahead in all: what is refused is that, and not the board.
-        let said = said_of(folder.path(), &photo, &["--board", size]);
+        // Detected in each, but fronto-parallel in all: the poses are refused, not the board.
+        let said = messages_for(folder.path(), &photo, &["--board", size]);
         assert!(
             said.contains("do not determine the intrinsics: the largest tilt of the board is 0°"),
             "{size}: {said}"
@@ -87,7 +87,7 @@ fn boards_that_look_the_same_after_half_a_turn_are_found_as_they_are() {
 }
 
 #[test]
-fn calibrations_that_are_broken_or_bombs_are_refused() {
+fn malformed_calibration_files_and_entity_bombs_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let camera = "schema: cv-camera/1\nwidth: 160\nheight: 120\nfx: 130.25\nfy: 131\ncx: 80\ncy: 59.5\n";
     fs::write(folder.path().join("good.yaml"), camera).unwrap();

@@ -1,4 +1,4 @@
-//! Cameras and rigs in the files that other programs write.
+//! Cameras and rigs in the file formats of other programs.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -9,7 +9,7 @@ use serde_json::Value;
 use std::{fs, path::Path};
 use support::{json, refused, run};
 
-/// Matches of points in front of two cameras 0.1 apart, of 640×480 px and a focal length of 500 px.
+/// Returns matches of points in two cameras with a baseline of 0.1, 640×480 px and a focal length of 500 px.
 fn write_matches(folder: &Path) {
     let view = |[x, y, z]: [f64; 3]| (500.0 * x / z + 320.0, 500.0 * y / z + 240.0);
     let row = |i: u32| {
@@ -20,7 +20,7 @@ fn write_matches(folder: &Path) {
     fs::write(folder.join("m.txt"), (0..60).map(row).collect::<String>()).unwrap();
 }
 
-/// What `estimate` says of a camera file.
+/// Returns the message of `cv estimate` for a camera file.
 fn estimate(folder: &Path, camera: &str, more: &[&str]) -> support::Ran {
     fs::write(folder.join("camera.txt"), camera).unwrap();
     run(folder, &[&["estimate", "essential", "--matches", "m.txt", "--camera", "camera.txt"], more].concat())
@@ -54,7 +54,7 @@ fn opencv_matrix(name: &str, rows: usize, data: &[f64]) -> String {
     format!("{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: {data:?}\n")
 }
 
-/// OpenCV's `intrinsics.yml` and `extrinsics.yml`, with a rational lens.
+/// Returns OpenCV's `intrinsics.yml` and `extrinsics.yml` with a rational lens.
 fn opencv_files() -> [String; 2] {
     let k = [150.0, 0.0, 99.5, 0.0, 150.0, 74.5, 0.0, 0.0, 1.0];
     let d = [0.1, -0.05, 0.0, 0.0, 0.01, 0.12, -0.04, 0.01];
@@ -69,7 +69,7 @@ fn opencv_files() -> [String; 2] {
     [format!("{head}{}", intrinsics.collect::<String>()), format!("{head}{}", extrinsics.concat())]
 }
 
-/// Rectifies a small pair by rig files of these contents.
+/// Rectifies a small pair with rig files of these contents.
 fn rectify_args(folder: &Path, files: &[&str]) -> Vec<String> {
     let photo = RgbU8::from_fn(200, 150, |x, y| [((x / 7 * 37 + y / 5 * 91) % 251) as u8; 3]);
     cv_io::write_png(folder.join("left.png"), photo.view()).unwrap();
@@ -84,12 +84,12 @@ fn rectify_args(folder: &Path, files: &[&str]) -> Vec<String> {
 
 fn rectified(files: &[&str]) -> Value {
     let folder = tempfile::tempdir().unwrap();
-    // The pair shows nothing of the calibration: no fault can be found.
+    // Images without features: the calibration cannot be checked.
     json(folder.path(), &support::strs(&rectify_args(folder.path(), files)))
 }
 
 #[test]
-fn rigs_of_kalibr_and_of_opencv_in_two_files() {
+fn rigs_of_kalibr_and_opencv_in_two_files_are_read() {
     let [intrinsics, extrinsics] = opencv_files();
     let both = rectified(&[&intrinsics, &extrinsics]);
     let kalibr = rectified(&[KALIBR]);
@@ -97,18 +97,18 @@ fn rigs_of_kalibr_and_of_opencv_in_two_files() {
         assert!((value["baseline"].as_f64().unwrap() - 0.12).abs() < 1e-9, "{value}");
         assert_eq!((value["width"].as_u64(), value["height"].as_u64()), (Some(200), Some(150)));
     }
-    // The files in the other order, and both in one, are the same rig.
+    // The files in the other order and merged into one give the same rig.
     for files in [&[&extrinsics[..], &intrinsics][..], &[&format!("{intrinsics}{}", &extrinsics[14..])]] {
         let value = rectified(files);
         assert_eq!((&value["q"], &value["focal_px"]), (&both["q"], &both["focal_px"]));
     }
-    // Its eight coefficients are all heeded.
+    // All eight coefficients are used.
     let plain = intrinsics.replace("0.12, -0.04, 0.01]", "0.0, 0.0, 0.0]");
     assert_ne!(rectified(&[&plain, &extrinsics])["focal_px"], both["focal_px"]);
 }
 
 #[test]
-fn half_a_rig_is_told_where_the_other_half_is_looked_for() {
+fn an_incomplete_opencv_rig_names_the_missing_file() {
     let [intrinsics, extrinsics] = opencv_files();
     for half in [&intrinsics, &extrinsics] {
         let folder = tempfile::tempdir().unwrap();
@@ -122,7 +122,7 @@ fn half_a_rig_is_told_where_the_other_half_is_looked_for() {
 }
 
 #[test]
-fn a_bare_matrix_has_the_size_of_the_photographs_and_hardly_any_skew() {
+fn a_bare_matrix_takes_the_size_of_the_photographs_and_only_a_small_skew() {
     let folder = tempfile::tempdir().unwrap();
     write_matches(folder.path());
     let size = ["--size", "640x480"];
@@ -135,7 +135,7 @@ fn a_bare_matrix_has_the_size_of_the_photographs_and_hardly_any_skew() {
     assert!(ran.stderr.contains("0.048 px"), "{ran:?}");
     let ran = estimate(folder.path(), &k("2.5"), &size);
     assert!(ran.code == Some(1) && ran.stderr.contains("skew of 2.5") && ran.stderr.contains("1.20 px"), "{ran:?}");
-    // Nothing tells the size of matches.
+    // Matches do not have an image size.
     let ran = estimate(folder.path(), &k("0"), &[]);
     assert!(ran.code == Some(1) && ran.stderr.contains("--size 640x480"), "{ran:?}");
     // Photographs do.
@@ -148,7 +148,7 @@ fn a_bare_matrix_has_the_size_of_the_photographs_and_hardly_any_skew() {
 }
 
 #[test]
-fn a_lens_that_is_not_known_is_named_with_those_that_are() {
+fn an_unknown_lens_model_is_refused_with_the_list_of_known_ones() {
     let folder = tempfile::tempdir().unwrap();
     write_matches(folder.path());
     let size = ["--size", "640x480"];

@@ -1,4 +1,4 @@
-//! Options out of a file.
+//! Options from a configuration file.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -7,7 +7,7 @@ mod support;
 use std::{fs, path::Path};
 use support::{done, run};
 
-/// Matches that one shift explains.
+/// Writes matches with a common translation.
 fn folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let row = |i: u32| (f64::from(i * 37 % 97), f64::from(i * 53 % 89));
@@ -23,7 +23,7 @@ fn config(folder: &Path, text: &str) {
 const ESTIMATE: [&str; 4] = ["estimate", "homography", "--matches", "m.txt"];
 
 #[test]
-fn options_of_the_file_hold_and_the_command_line_wins() {
+fn the_command_line_overrides_the_configuration_file() {
     let folder = folder();
     let folder = folder.path();
     let said = |more: &[&str]| done(folder, &[&ESTIMATE[..], more].concat()).stderr;
@@ -32,22 +32,22 @@ fn options_of_the_file_hold_and_the_command_line_wins() {
     assert!(said(&["--threshold", "2"]).contains("within 2 px"));
     fs::write(folder.join("other.toml"), "[estimate]\nthreshold = 1.5\n").unwrap();
     assert!(said(&["--config", "other.toml"]).contains("within 1.5 px"));
-    // A file is a file of the folder it is in.
+    // Paths are relative to the folder of the configuration file.
     let out = tempfile::tempdir().unwrap();
     fs::copy(folder.join("m.txt"), out.path().join("m.txt")).unwrap();
     assert!(done(out.path(), &ESTIMATE).stderr.contains("within 3 px"));
-    // What is required may stand there, and a flag.
+    // Required options and flags are allowed.
     config(folder, "json = true\n[estimate]\nmatches = \"m.txt\"\n");
     let ran = done(folder, &ESTIMATE[..2]);
     assert!(serde_json::from_str::<serde_json::Value>(&ran.stdout).unwrap()["inliers"].as_array().unwrap().len() == 40);
-    // What the command line excludes does not hold.
+    // Entries that conflict with the command line are ignored.
     config(folder, "[estimate]\ncamera = \"no-such-file\"\n");
     let ran = run(folder, &["estimate", "essential", "--matches", "m.txt", "--focal", "50", "--size", "100x90"]);
     assert!(!ran.stderr.contains("no-such-file"), "{ran:?}");
 }
 
 #[test]
-fn what_the_file_has_wrong_is_named() {
+fn errors_of_the_configuration_file_name_the_entry() {
     let folder = folder();
     for (text, word) in [
         ("[estimate]\ntreshold = 1\n", "“treshold”"),
@@ -70,7 +70,7 @@ fn what_the_file_has_wrong_is_named() {
 }
 
 #[test]
-fn what_holds_is_printed_as_a_file_that_gives_it() {
+fn the_effective_configuration_is_printed_as_a_valid_file() {
     let folder = folder();
     let folder = folder.path();
     config(folder, "threads = 2\n[depth]\ndisparities = \"auto\"\nno-fill = true\n");
@@ -80,7 +80,7 @@ fn what_holds_is_printed_as_a_file_that_gives_it() {
         assert!(lines.contains(&line), "{line}: {text}");
     }
     assert!(!text.contains("print-config"));
-    // It reads back to the same.
+    // The printed file gives the same configuration.
     fs::write(folder.join("again.toml"), &text).unwrap();
     assert_eq!(done(folder, &["depth", "--print-config", "--config", "again.toml"]).stdout, text);
 }

@@ -9,11 +9,11 @@ use cv_synth::corrupt;
 use std::fs;
 use support::{done, fixture, run, snapshot};
 
-/// Runs on damaged inputs, of each file.
+/// Number of damaged versions of each file.
 const RUNS: u64 = 8;
 
 #[test]
-fn damaged_inputs_are_read_or_refused_and_nothing_else() {
+fn damaged_inputs_are_read_or_refused_without_a_crash() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     for side in ["left", "right"] {

@@ -1,4 +1,4 @@
-//! `cv depth` and `cv eval disparity` from outside.
+//! `cv depth` and `cv eval disparity` as a black box.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -9,14 +9,14 @@ use cv_synth::{RenderOptions, Scene, StereoPair, stereo_pair};
 use std::sync::LazyLock;
 use support::{done, json, refused, run};
 
-/// A small generated pair and its truth.
+/// A small generated pair with ground truth.
 static PAIR: LazyLock<StereoPair> = LazyLock::new(|| {
     let scene = Scene::room(5);
     let camera = Camera::from_focal(240, 180, 210.0);
     stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap()
 });
 
-/// [`PAIR`] as files in a new folder.
+/// Writes [`PAIR`] as files to a new folder.
 fn pair() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let pair = &*PAIR;
@@ -73,13 +73,13 @@ fn a_generated_pair_becomes_disparity_depth_and_cloud() {
             .all(|words| page.contains(words))
     );
     assert_eq!(cv_io::read_rgb(at("error.png")).unwrap().size(), (240, 180));
-    // A wrong sign, unit or row order would be off everywhere; a sound matcher is wrong at a few outlines.
+    // A false sign, unit or row order would be wrong everywhere; a correct matcher is wrong only near depth discontinuities.
     assert!(scores["non_occluded"]["bad"]["2.0"].as_f64().unwrap() < 0.1, "{scores}");
     assert!(scores["all"]["pixels"].as_u64().unwrap() == 240 * 180);
 }
 
 #[test]
-fn the_formats_hold_the_same_map() {
+fn every_output_format_has_the_same_map() {
     let folder = pair();
     for name in ["d.pfm", "d.npy", "d.png"] {
         done(folder.path(), &["depth", "left.png", "right.png", "-o", name, "--disparities", "48", "--quiet"]);
@@ -93,7 +93,7 @@ fn the_formats_hold_the_same_map() {
 }
 
 #[test]
-fn frames_come_out_as_pairs_do() {
+fn frames_of_a_sequence_equal_single_pairs() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);
     for side in ["left", "right"] {
@@ -103,7 +103,7 @@ fn frames_come_out_as_pairs_do() {
         }
     }
     done(folder.path(), &["depth", "left.png", "right.png", "-o", "one.pfm", "--disparities", "48"]);
-    // The folder comes into being with the first frame.
+    // The folder is created with the first frame.
     let value = json(folder.path(), &["depth", "left", "right", "-o", "out", "--disparities", "48"]);
     assert_eq!(value["frames"], 2);
     assert!(value["frames_per_second"].as_f64().unwrap() > 0.0);
@@ -119,9 +119,9 @@ fn frames_come_out_as_pairs_do() {
     assert!(!at("nowhere").exists());
 }
 
-/// Everything that a pair gives, frames give too.
+/// Sequences have every output of a single pair.
 #[test]
-fn frames_of_a_rig_come_out_whole() {
+fn a_sequence_of_a_rig_has_every_output_of_each_frame() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);
     let camera = "{width: 240, height: 180, fx: 210, fy: 210, cx: 119.5, cy: 89.5, distortion: radial, coefficients: [-0.05, 0.01]}";
@@ -163,29 +163,29 @@ fn frames_of_a_rig_come_out_whole() {
     }
     let page = std::fs::read_to_string(at("page/report.html")).unwrap();
     assert!(page.contains("left/f1.png") && page.contains("left/f2.png"));
-    // Frames that would be written to one file.
+    // Frames with the same output file.
     std::fs::copy(at("left.png"), at("left/f2.bmp")).unwrap();
     let text = refused(folder.path(), &["depth", "left", "right", "-o", "two", "--pair-by", "order"]).stderr;
     assert!(text.contains("left frames and") || text.contains("one file"), "{text}");
     assert!(!at("two").exists());
-    // A frame of another size than its camera's.
+    // A frame of another size than its camera.
     cv_io::write_png(at("left/f2.png"), RgbU8::new(120, 90, [99; 3]).view()).unwrap();
     let text = refused(folder.path(), &["depth", "left/*.png", "right", "-o", "two", "--rig", "rig.yaml"]).stderr;
     assert!(text.contains("left/f2.png is 120×90 px"), "{text}");
 }
 
 #[test]
-fn the_range_can_be_found_from_the_pictures() {
+fn the_disparity_range_is_estimated_from_the_images() {
     let folder = pair();
     let value = json(folder.path(), &["depth", "left.png", "right.png", "-o", "d.pfm", "--disparities", "auto"]);
     assert!((20..=80).contains(&value["disparities"].as_u64().unwrap()), "{value}");
     let scores = json(folder.path(), &["eval", "disparity", "--estimate", "d.pfm", "--truth", "truth.pfm"]);
-    // All pixels, hidden ones included: a range that cuts things off would be wrong on all of them.
+    // Over all pixels, occluded ones included: a truncated range would be wrong on many of them.
     assert!(scores["all"]["bad"]["2.0"].as_f64().unwrap() < 0.2, "{scores}");
 }
 
 #[test]
-fn an_exchanged_pair_is_no_pair_whoever_finds_the_range() {
+fn a_swapped_pair_is_refused_with_any_choice_of_the_range() {
     let folder = pair();
     for range in ["auto", "48"] {
         let depth =
@@ -195,7 +195,7 @@ fn an_exchanged_pair_is_no_pair_whoever_finds_the_range() {
         assert!(text.contains("exchange"), "{text}");
         assert!(["d.pfm", "z.pfm", "c.ply"].iter().all(|name| !folder.path().join(name).exists()));
     }
-    // An empty cloud is no success: the room ends at a few meters.
+    // An empty cloud is an error: the room ends at a few meters.
     let far = ["--disparities", "48", "--focal", "210", "--baseline", "0.25", "--near", "1000", "--cloud", "c.ply"];
     let text = refused(folder.path(), &[&["depth", "left.png", "right.png", "-o", "d.pfm"], &far[..]].concat()).stderr;
     assert!(text.contains("--near"), "{text}");
@@ -203,10 +203,10 @@ fn an_exchanged_pair_is_no_pair_whoever_finds_the_range() {
 }
 
 #[test]
-fn rows_that_are_a_little_apart_are_aligned() {
+fn a_small_vertical_disparity_is_corrected() {
     let folder = pair();
     let folder = folder.path();
-    // Lower by 2 px in the middle, by 1.2 at the left border and by 2.8 at the right one.
+    // A vertical disparity of 2 px at the center, 1.2 at the left border and 2.8 at the right one.
     let right = &PAIR.right.image;
     let lower = RgbU8::from_fn(240, 180, |x, y| {
         let at = (y as f64 - 2.0 - 1.6 * ((x as f64 + 0.5) / 240.0 - 0.5)).clamp(0.0, 178.999);
@@ -224,9 +224,9 @@ fn rows_that_are_a_little_apart_are_aligned() {
     assert!(json(folder, &args("right.png", "aligned.pfm"))["vertical_offset"].is_null());
     let found = json(folder, &args("lower.png", "d.pfm"));
     let offset: Vec<f64> = (0..3).map(|i| found["vertical_offset"][i].as_f64().unwrap()).collect();
-    // Features are placed to a few tenths of a pixel, and there are hundreds.
+    // Features are localized to a few tenths of a pixel, and there are hundreds.
     assert!((offset[0] - 2.0).abs() < 0.15 && (offset[1] - 1.6).abs() < 0.3 && offset[2].abs() < 0.3, "{offset:?}");
-    // Two interpolations blur the right photograph: a few points of a hundred.
+    // Two interpolations blur the right image: a few percent more bad pixels.
     let (aligned, moved) = (right_ones("aligned.pfm"), right_ones("d.pfm"));
     assert!(moved > 0.95 * aligned, "{moved} of {aligned}");
     let as_it_is = [&args("lower.png", "none.pfm")[..], &["--no-align"]].concat();
@@ -236,7 +236,7 @@ fn rows_that_are_a_little_apart_are_aligned() {
 }
 
 #[test]
-fn frames_of_other_moments_are_not_paired() {
+fn sequences_with_unpaired_frames_are_refused() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);
     for (side, first) in [("left", 1), ("right", 2)] {
@@ -250,7 +250,7 @@ fn frames_of_other_moments_are_not_paired() {
     assert!(["frame_0001", "frame_0005", "--pair-by order"].iter().all(|part| text.contains(part)), "{text}");
     assert!(!at("out").exists());
     assert_eq!(json(folder.path(), &[&frames[..], &["--pair-by", "order"]].concat())["frames"], 4);
-    // Those that both have, by a pattern.
+    // The common frames, by a pattern.
     let some = ["depth", "left/frame_%04d.png", "right/frame_000[x]*", "-o", "out"];
     refused(folder.path(), &some);
     let value = json(
@@ -273,10 +273,10 @@ fn the_result_is_the_same_for_any_number_of_threads() {
 }
 
 #[test]
-fn a_range_far_from_zero_finds_what_lies_there() {
+fn a_disparity_range_far_from_zero_matches_objects_in_it() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);
-    // The same pair with 60 columns cut off on the right of one and on the left of the other: 60 px more everywhere.
+    // 60 columns are cropped on the right of one image and on the left of the other, which adds 60 px to every disparity.
     const MORE: usize = 60;
     let [left, right] = ["left.png", "right.png"].map(|name| cv_io::read_rgb(at(name)).unwrap());
     let width = left.width() - MORE;
@@ -290,7 +290,7 @@ fn a_range_far_from_zero_finds_what_lies_there() {
         &["depth", "left.png", "right.png", "-o", "plain.pfm", "--matched", "p.png", "--disparities", "48"],
     );
     let truth = cv_io::pfm::read(at("truth.pfm")).unwrap();
-    // Of the pixels whose match lies inside the cut picture: all, those confirmed, and those within 1 px.
+    // Pixels with a match inside the cropped image: all, those matched, and those within 1 px.
     let count = |disparity: &str, mask: &str, more: usize| {
         let (map, mask) = (cv_io::pfm::read(at(disparity)).unwrap(), cv_io::read_gray_u8(at(mask)).unwrap());
         let [mut all, mut kept, mut good] = [0.0f64; 3];
@@ -306,7 +306,7 @@ fn a_range_far_from_zero_finds_what_lies_there() {
         (kept / all, good / kept)
     };
     let (far, plain) = (count("d.pfm", "m.png", MORE), count("plain.pfm", "p.png", 0));
-    // The same pictures and range but for the shift, and five columns of border more or less: one in forty.
+    // The same images with a shifted range, and a border that differs by five columns: one in forty.
     assert!(plain.0 > 0.8 && (far.0 - plain.0).abs() < 0.025 && (far.1 - plain.1).abs() < 0.025, "{far:?} {plain:?}");
     let page = std::fs::read_dir(at("r")).unwrap().map(|e| e.unwrap().path());
     let page = page.into_iter().find(|p| p.extension().is_some_and(|e| e == "html")).unwrap();
@@ -314,7 +314,7 @@ fn a_range_far_from_zero_finds_what_lies_there() {
 }
 
 #[test]
-fn what_cannot_be_done_is_said_and_nothing_is_written() {
+fn invalid_requests_are_refused_with_the_reason_and_nothing_is_written() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);
     cv_io::write_png(at("dot.png"), RgbU8::new(1, 1, [9; 3]).view()).unwrap();
@@ -347,7 +347,7 @@ fn what_cannot_be_done_is_said_and_nothing_is_written() {
 }
 
 #[test]
-fn what_a_disparity_is_worth_comes_out_too() {
+fn confidence_matched_mask_and_uncertainty_are_written() {
     let folder = pair();
     let ran = done(
         folder.path(),
@@ -371,7 +371,7 @@ fn what_a_disparity_is_worth_comes_out_too() {
             "70",
         ],
     );
-    // Said before the work.
+    // Refused before the computation.
     assert!(ran.stderr.contains("240×180 px at 70 disparities takes ") && ran.stderr.contains("MiB"), "{ran:?}");
     let read = |name: &str| cv_io::pfm::read(folder.path().join(name)).unwrap();
     let (d, c, u) = (read("d.pfm"), read("c.pfm"), read("u.pfm"));
@@ -381,7 +381,7 @@ fn what_a_disparity_is_worth_comes_out_too() {
         let is_matched = m.at(x, y)[0] == 255;
         matched += usize::from(is_matched);
         let (confidence, bar) = (c.at(x, y)[0], u.at(x, y)[0]);
-        // Every pixel has a disparity, those on the left border too; filled ones have no confidence.
+        // Every pixel has a disparity, also at the left border; filled pixels have no confidence.
         assert!(d.at(x, y)[0].is_finite() && bar > 0.0);
         assert!(if is_matched { (0.0..=1.0).contains(&confidence) } else { confidence == 0.0 });
     }
@@ -389,7 +389,7 @@ fn what_a_disparity_is_worth_comes_out_too() {
 }
 
 #[test]
-fn costs_smoothing_ranges_and_memory_can_be_chosen() {
+fn costs_penalties_ranges_and_memory_are_options() {
     let folder = pair();
     let score = |more: &[&str]| {
         done(folder.path(), &[&["depth", "left.png", "right.png", "-o", "d.pfm"], more].concat());
@@ -405,7 +405,7 @@ fn costs_smoothing_ranges_and_memory_can_be_chosen() {
         &["--min-disparity", "3", "--disparities", "61"],
         &["--max-memory", "6", "--disparities", "64"],
     ] {
-        // Hidden pixels are counted: as for the range found from the pictures above.
+        // Occluded pixels are included, as in the test of the estimated range above.
         let bad = score(more);
         assert!(bad < 0.2, "{more:?}: {bad}");
     }
@@ -413,7 +413,7 @@ fn costs_smoothing_ranges_and_memory_can_be_chosen() {
 }
 
 #[test]
-fn gray_and_sixteen_bits_match_as_color_does() {
+fn gray_and_16_bit_images_match_like_color() {
     let folder = pair();
     let at = |name: &str| folder.path().join(name);
     for side in ["left", "right"] {
@@ -426,14 +426,14 @@ fn gray_and_sixteen_bits_match_as_color_does() {
         let (left, right, out) = (format!("left{bits}.png"), format!("right{bits}.png"), format!("d{bits}.pfm"));
         done(folder.path(), &["depth", &left, &right, "-o", &out]);
     }
-    // Sixteen bits that say the same as eight give the same map.
+    // 16-bit images with the values of the 8-bit ones give the same map.
     assert!(std::fs::read(at("d8.pfm")).unwrap() == std::fs::read(at("d16.pfm")).unwrap());
     let scores = json(folder.path(), &["eval", "disparity", "--estimate", "d16.pfm", "--truth", "truth.pfm"]);
     assert!(scores["all"]["bad"]["2.0"].as_f64().unwrap() < 0.2, "{scores}");
 }
 
 #[test]
-fn what_is_no_pair_is_refused_with_what_to_try() {
+fn images_that_are_no_rectified_pair_are_refused_with_a_remedy() {
     let folder = pair();
     cv_io::write_png(folder.path().join("gray.png"), RgbU8::new(240, 180, [99; 3]).view()).unwrap();
     for (left, right) in [("gray.png", "gray.png"), ("gray.png", "right.png")] {
@@ -445,7 +445,7 @@ fn what_is_no_pair_is_refused_with_what_to_try() {
     assert!(!folder.path().join("out.pfm").exists());
 }
 
-/// Peak resident memory of a command in KiB, as the kernel counts it.
+/// Returns the peak resident memory of a command in KiB.
 #[cfg(target_os = "linux")]
 fn peak_of_frames(frames: usize, more: &[&str]) -> f64 {
     let folder = pair();
@@ -465,7 +465,7 @@ fn peak_of_frames(frames: usize, more: &[&str]) -> f64 {
     let status = format!("/proc/{}/status", child.id());
     let mut peak = 0.0f64;
     while child.try_wait().unwrap().is_none() {
-        // Gone between the two calls: it has ended.
+        // The process ended between the two calls.
         let text = std::fs::read_to_string(&status).unwrap_or_default();
         let line = text.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap_or("0");
         peak = peak.max(line.trim().trim_end_matches(" kB").trim().parse().unwrap_or(0.0));
@@ -477,12 +477,12 @@ fn peak_of_frames(frames: usize, more: &[&str]) -> f64 {
 
 #[test]
 #[cfg(target_os = "linux")]
-fn many_frames_take_the_memory_of_few() {
+fn memory_does_not_grow_with_the_number_of_frames() {
     let whole = ["--focal", "210", "--baseline", "0.25", "--depth", "z", "--cloud", "c", "--disparities", "64"];
     for more in [&[][..], &whole] {
         let (few, many) = (peak_of_frames(6, more), peak_of_frames(60, more));
-        // A frame's buffers are 9 MB, its pictures 0.3 MB: 54 further frames would add 16 MB at the least if anything of
-        // them were kept.
+        // A frame has buffers of 9 MB and images of 0.3 MB: 54 further frames would add at least 16 MB if any of it
+        // were retained.
         assert!(few > 1000.0 && many < few + 8192.0, "{few} and {many} KiB");
     }
 }

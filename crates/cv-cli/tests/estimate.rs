@@ -1,4 +1,4 @@
-//! `cv estimate` from outside: the three models, and matches that determine none.
+//! `cv estimate` as a black box: the three models, and degenerate matches.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -7,7 +7,7 @@ mod support;
 use std::{fs, path::Path};
 use support::{json, refused, run};
 
-/// Matches of a camera of 800 px focal length that moves to the right and turns by 0.1 rad about the vertical, and every fifth one wrong.
+/// Returns matches of a camera with a focal length of 800 px that moves to the right and rotates by 0.1 rad about the vertical; every fifth is an outlier.
 fn two_views(flat: bool) -> Vec<[f64; 4]> {
     let mut state = 5u32;
     let mut random = || {
@@ -20,7 +20,7 @@ fn two_views(flat: bool) -> Vec<[f64; 4]> {
         let (u, v) = (640.0 * random(), 480.0 * random());
         let z = if flat { 6.0 } else { 4.0 + 6.0 * random() };
         let (x, y) = ((u - 319.5) / 800.0 * z, (v - 239.5) / 800.0 * z);
-        // R about y, then one unit to the left: the camera went right.
+        // Rotation about y, then a translation by one unit to the left: the camera moved to the right.
         let (p, r) = (cos * x + sin * z - 1.0, -sin * x + cos * z);
         let seen = [800.0 * p / r + 319.5, 800.0 * y / r + 239.5];
         if rows.len() % 5 == 4 {
@@ -44,13 +44,13 @@ fn an_essential_matrix_gives_the_pose() {
     let args = ["estimate", "essential", "--matches", "m.txt", "--focal", "800", "--size", "640x480"];
     let result = json(folder.path(), &args);
     let at = |key: &str, i: usize, j: usize| result[key][i][j].as_f64().unwrap();
-    // The right matches are exact: what is left are wrong ones within a pixel of their lines, which the weights nearly ignore.
+    // The inliers are exact: the rest are outliers within a pixel of their epipolar lines, with small weights.
     assert!((at("rotation", 0, 2) - 0.1f64.sin()).abs() < 1e-3 && (at("rotation", 1, 1) - 1.0).abs() < 1e-3);
     assert!((result["translation"][0].as_f64().unwrap() + 1.0).abs() < 1e-3);
     assert!(result["inliers"].as_array().unwrap().len() >= 160);
-    // bᵀ E a = 0 with a = (0, 0, 1), which the turn alone brings to (tan 0.1, 0, 1): E of a sideways motion has no entry there.
+    // bᵀ E a = 0 with a = (0, 0, 1), which the rotation alone maps to (tan 0.1, 0, 1): E of a sideways motion has no entry there.
     assert!(at("model", 0, 0).abs() < 1e-2);
-    // The same from a camera file.
+    // The same with a camera file.
     fs::write(folder.path().join("k.txt"), "800 0 319.5\n0 800 239.5\n0 0 1\n").unwrap();
     let again =
         json(folder.path(), &["estimate", "essential", "--matches", "m.txt", "--camera", "k.txt", "--size", "640x480"]);
@@ -60,7 +60,7 @@ fn an_essential_matrix_gives_the_pose() {
 }
 
 #[test]
-fn planes_and_scenes_with_depth() {
+fn planes_give_homographies_and_scenes_with_depth_fundamental_matrices() {
     let folder = tempfile::tempdir().unwrap();
     write(folder.path(), "deep.txt", &two_views(false));
     write(folder.path(), "flat.txt", &two_views(true));
@@ -68,14 +68,14 @@ fn planes_and_scenes_with_depth() {
     assert!(deep["inliers"].as_array().unwrap().len() >= 160);
     let flat = json(folder.path(), &["estimate", "homography", "--matches", "flat.txt"]);
     assert!(flat["inliers"].as_array().unwrap().len() >= 160);
-    // Without wrong matches nothing at all fixes the epipole.
+    // Exact matches of a plane leave the epipole undetermined.
     let exact: Vec<_> = two_views(true).into_iter().enumerate().filter(|(i, _)| i % 5 != 4).map(|r| r.1).collect();
     write(folder.path(), "flat.txt", &exact);
     let said = refused(folder.path(), &["estimate", "fundamental", "--matches", "flat.txt"]).stderr;
     assert!(said.contains("a plane"), "{said}");
 }
 
-/// Numbers from `low` to `high`, always the same.
+/// Returns deterministic pseudorandom numbers from `low` to `high`.
 fn numbers(low: f64, high: f64) -> impl FnMut() -> f64 {
     let mut state = 9u32;
     move || {
@@ -84,7 +84,7 @@ fn numbers(low: f64, high: f64) -> impl FnMut() -> f64 {
     }
 }
 
-/// A name, the matches, and what each model says, in the order homography, fundamental, essential; nothing where it is found.
+/// Name, matches, and the message of each model in the order homography, fundamental, essential; empty if the model is estimated.
 type Case<'a> = (&'a str, &'a [[f64; 4]], [&'a str; 3]);
 
 fn random(n: usize, low: f64, high: f64) -> Vec<[f64; 4]> {
@@ -93,7 +93,7 @@ fn random(n: usize, low: f64, high: f64) -> Vec<[f64; 4]> {
 }
 
 #[test]
-fn matches_that_determine_nothing_are_refused_with_the_reason() {
+fn degenerate_matches_are_refused_with_the_reason() {
     let folder = tempfile::tempdir().unwrap();
     let good = two_views(false);
     let exact: Vec<_> = two_views(true).into_iter().enumerate().filter(|(i, _)| i % 5 != 4).map(|r| r.1).collect();
@@ -143,7 +143,7 @@ fn matches_that_determine_nothing_are_refused_with_the_reason() {
             }
         }
     }
-    // One wild coordinate is a wrong match like any other.
+    // One coordinate of extreme size is an outlier like any other.
     let mut wild = good;
     wild[4][0] = 1e9;
     write(folder.path(), "m.txt", &wild);
@@ -154,7 +154,7 @@ fn matches_that_determine_nothing_are_refused_with_the_reason() {
 }
 
 #[test]
-fn wrong_matches_alone_are_no_more_than_chance() {
+fn random_matches_have_no_significant_model() {
     let folder = tempfile::tempdir().unwrap();
     write(folder.path(), "wrong.txt", &random(300, 0.0, 480.0));
     write(folder.path(), "right.txt", &two_views(false));
@@ -167,7 +167,7 @@ fn wrong_matches_alone_are_no_more_than_chance() {
         assert!(said.contains("no more than expected by chance; at least "), "{model}: {said}");
         args[3] = "right.txt";
         if model != "homography" {
-            // Of 160 right ones beside 40 wrong ones, chance gives one set in 10^100: each of those beyond a sample is near with one in a hundred.
+            // Significance: 160 inliers beside 40 outliers occur by chance in one set of 10^100.
             assert!(json(folder.path(), &args)["log10_false_alarms"].as_f64().unwrap() < -100.0, "{model}");
         }
     }

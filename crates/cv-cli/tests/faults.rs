@@ -1,5 +1,5 @@
-//! What goes wrong around the program: a full disk, places that cannot be written to, two runs at once. Old outputs stay whole, and nothing is
-//! left behind. (Runs that are killed: `outputs.rs`, and 200 of them in `cargo xtask trust killed`.)
+//! Failures of the environment: a full disk, unwritable folders, two concurrent runs. Old outputs stay complete, and no temporary file
+//! remains. (Killed runs: `outputs.rs`, and 200 of them in `cargo xtask trust killed`.)
 
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
@@ -15,7 +15,7 @@ use std::{
 };
 use support::{Ran, cv, done, fixture, refused, snapshot, strs};
 
-/// A command that takes some ten milliseconds: its arguments, its outputs.
+/// Commands that take some ten milliseconds: arguments and outputs.
 type Job = (&'static str, &'static [&'static str]);
 
 const JOBS: &[Job] = &[
@@ -37,7 +37,7 @@ const RIG: &str = "schema: cv-rig/1\nunit: m\n\
     right: {width: 130, height: 90, fx: 121, fy: 120, cx: 64, cy: 45}\n\
     rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\ntranslation: [-0.12, 0, 0]\n";
 
-/// Part of a pair, a mask, a rig and a disparity map.
+/// Creates a folder with a crop of a pair, a mask, a rig and a disparity map.
 fn inputs(folder: &Path) {
     fs::create_dir(folder.join("masks")).unwrap();
     for side in ["left", "right"] {
@@ -56,7 +56,7 @@ fn words(args: &str) -> Vec<&str> {
     args.split(' ').collect()
 }
 
-/// A run under a limit that the shell sets.
+/// Runs a command under a limit set by the shell.
 fn limited(folder: &Path, limit: &str, args: &str) -> Ran {
     let output = Command::new("sh")
         .args(["-c", &format!("{limit}; exec \"$0\" \"$@\""), env!("CARGO_BIN_EXE_cv")])
@@ -68,7 +68,7 @@ fn limited(folder: &Path, limit: &str, args: &str) -> Ran {
     Ran { code: output.status.code(), stdout: text(output.stdout), stderr: text(output.stderr) }
 }
 
-/// Every output holds what an older run may have written.
+/// Fills every output with the contents of an older run.
 fn write_old(folder: &Path, outputs: &[&str]) {
     for output in outputs {
         fs::create_dir_all(folder.join(output).parent().unwrap()).unwrap();
@@ -77,19 +77,19 @@ fn write_old(folder: &Path, outputs: &[&str]) {
 }
 
 #[test]
-fn a_disk_that_is_full_leaves_old_outputs_whole_and_is_named() {
+fn a_full_disk_is_reported_and_leaves_old_outputs_unchanged() {
     for (args, outputs) in JOBS {
         let folder = tempfile::tempdir().unwrap();
         let folder = folder.path();
         inputs(folder);
         write_old(folder, outputs);
         let before = snapshot(folder);
-        // No file may grow beyond half a kilobyte: writing fails in the middle of the first output.
+        // File size limit of half a kilobyte: the write fails in the middle of the first output.
         let ran = limited(folder, "trap '' XFSZ; ulimit -f 1", args);
         assert_eq!(ran.code, Some(1), "{args}: {ran:?}");
         assert!(ran.stderr.contains("error: ") && ran.stderr.contains("too large"), "{args}: {ran:?}");
         assert!(snapshot(folder) == before, "{args}");
-        // The same, but the operating system ends the program at that moment. What it leaves, the next run removes.
+        // The same, but the signal kills the program. The next run removes its temporary files.
         let ran = limited(folder, "ulimit -c 0; ulimit -f 1", args);
         assert_eq!(ran.code, None, "{args}: {ran:?}");
         for output in *outputs {
@@ -106,7 +106,7 @@ fn a_disk_that_is_full_leaves_old_outputs_whole_and_is_named() {
 }
 
 #[test]
-fn a_device_without_room_is_an_error_too() {
+fn a_full_device_is_reported_as_an_error() {
     for (args, outputs) in &JOBS[..3] {
         let folder = tempfile::tempdir().unwrap();
         inputs(folder.path());
@@ -116,7 +116,7 @@ fn a_device_without_room_is_an_error_too() {
     }
     let folder = tempfile::tempdir().unwrap();
     inputs(folder.path());
-    // Stdout, as a pipe to a file on a full disk.
+    // Stdout redirected to a file on a full disk.
     let full = || Stdio::from(fs::File::options().write(true).open("/dev/full").unwrap());
     for args in
         ["eval disparity --estimate e.png --truth e.png --json", "eval disparity --estimate e.png --truth e.png -o -"]
@@ -130,9 +130,9 @@ fn a_device_without_room_is_an_error_too() {
     }
 }
 
-/// Folders of the kernel, where root cannot make a file either.
+/// Folders of the kernel in which not even root can create a file.
 #[test]
-fn where_nobody_may_write_nothing_is_begun() {
+fn an_unwritable_folder_is_refused_before_the_computation() {
     for (args, outputs) in JOBS {
         for place in ["/proc", "/sys/kernel", "/proc/self/fd"] {
             let folder = tempfile::tempdir().unwrap();
@@ -150,9 +150,9 @@ fn where_nobody_may_write_nothing_is_begun() {
     }
 }
 
-/// A file that opens and then fails: the first page of a process's memory is mapped nowhere.
+/// A file that opens and then fails to read: the unmapped first page of a process's memory.
 #[test]
-fn an_input_that_cannot_be_read_to_its_end_is_named() {
+fn an_input_with_a_read_error_is_named() {
     let folder = tempfile::tempdir().unwrap();
     inputs(folder.path());
     symlink("/proc/self/mem", folder.path().join("broken.png")).unwrap();
@@ -168,14 +168,14 @@ fn an_input_that_cannot_be_read_to_its_end_is_named() {
     }
 }
 
-/// Each of two runs writes whole files; who comes last stays.
+/// Each of two concurrent runs writes complete files; the last one remains.
 #[test]
-fn two_runs_on_one_output_leave_that_of_one_of_them() {
+fn concurrent_runs_leave_the_complete_output_of_one() {
     for (args, outputs) in &JOBS[..4] {
         let folder = tempfile::tempdir().unwrap();
         let folder = folder.path();
         inputs(folder);
-        // The other run has the photographs exchanged, or the one for the other.
+        // The other run has other input files.
         let swapped: Vec<&str> = match words(args) {
             mut all if all.contains(&"right.png") => {
                 let at = all.iter().position(|word| *word == "left.png").unwrap();

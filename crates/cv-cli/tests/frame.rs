@@ -1,4 +1,4 @@
-//! What every command shares, seen from outside: usage, help, exit codes, stdout and stderr.
+//! Behavior common to all commands, as a black box: usage, help, exit codes, stdout and stderr.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -6,7 +6,7 @@ mod support;
 
 use support::{cv, done, json, refused, run};
 
-/// The names in the list of commands.
+/// Returns the names in the list of commands.
 fn commands() -> Vec<String> {
     let help = done(&std::env::temp_dir(), &["--help"]).stdout;
     let list = help.split("Commands:\n").nth(1).unwrap().split("\n\n").next().unwrap();
@@ -14,7 +14,7 @@ fn commands() -> Vec<String> {
     names.map(|line| line.split_whitespace().next().unwrap().to_owned()).filter(|name| name != "help").collect()
 }
 
-/// The names of a command and of the commands inside it.
+/// Returns the names of a command and its subcommands.
 fn commands_within(folder: &std::path::Path, name: &str) -> Vec<Vec<String>> {
     let help = done(folder, &[name, "--help"]).stdout;
     match help.split("Commands:\n").nth(1) {
@@ -31,7 +31,7 @@ fn commands_within(folder: &std::path::Path, name: &str) -> Vec<Vec<String>> {
 }
 
 #[test]
-fn every_command_explains_itself_by_examples() {
+fn the_help_of_every_command_has_examples() {
     let folder = tempfile::tempdir().unwrap();
     for name in commands() {
         for path in commands_within(folder.path(), &name) {
@@ -47,7 +47,7 @@ fn every_command_explains_itself_by_examples() {
 }
 
 #[test]
-fn wrong_usage_is_exit_code_2_and_leaves_stdout_alone() {
+fn wrong_usage_is_exit_code_2_without_output_on_stdout() {
     let folder = tempfile::tempdir().unwrap();
     let cases: [&[&str]; 7] = [
         &[],
@@ -74,7 +74,7 @@ fn wrong_usage_is_exit_code_2_and_leaves_stdout_alone() {
 }
 
 #[test]
-fn the_thread_count_is_the_one_asked_for() {
+fn the_option_threads_sets_the_thread_count() {
     let folder = tempfile::tempdir().unwrap();
     for threads in [1, 3] {
         let value = json(folder.path(), &["completions", "zsh", "--threads", &threads.to_string()]);
@@ -93,14 +93,14 @@ fn a_closed_stdout_is_a_failure_and_not_a_crash() {
         .unwrap();
     drop(child.stdout.take());
     let output = child.wait_with_output().unwrap();
-    // The script may have fitted into the pipe before it was closed: then the run was fine.
+    // The script may have fitted into the pipe's buffer before the pipe was closed; then the run succeeded.
     assert!(matches!(output.status.code(), Some(0 | 1)), "{output:?}");
     assert!(!String::from_utf8_lossy(&output.stderr).contains("panicked"), "{output:?}");
 }
 
-/// A global option that a command takes changes what it does, or it is refused: `--seed` and `--report` mean nothing to some.
+/// A global option either has an effect on a command or is refused, such as `--seed` and `--report` by some.
 #[test]
-fn options_that_mean_nothing_are_refused() {
+fn options_without_effect_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let matches: String = (0..40)
         .map(|i| (f64::from(i * 37 % 97), f64::from(i * 53 % 89)))
@@ -129,9 +129,9 @@ fn options_that_mean_nothing_are_refused() {
 }
 
 #[test]
-fn a_file_beyond_the_memory_allowed_is_refused_with_a_number_that_suffices() {
+fn a_file_above_the_memory_limit_is_refused_with_a_sufficient_limit() {
     let folder = tempfile::tempdir().unwrap();
-    // 2 MB as a file, as much again as a picture.
+    // 2 MB as a file, and as much again decoded.
     let mut map = b"Pf\n800 700\n-1\n".to_vec();
     map.resize(map.len() + 4 * 800 * 700, 0x3f);
     std::fs::write(folder.path().join("a.pfm"), map).unwrap();

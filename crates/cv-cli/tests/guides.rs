@@ -1,4 +1,4 @@
-//! The guides under `docs/` and the README: their commands run, what they promise to fail fails with those words, and their links lead somewhere.
+//! The guides under `docs/` and the README: their commands run, commands with a stated failure fail with that message, and their links are valid.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -11,7 +11,7 @@ use std::{
 };
 use support::done;
 
-/// In the order in which they run: each may use what those before it have written.
+/// The pages in the order of their execution: each may use the files of earlier ones.
 const GUIDES: [&str; 12] = [
     "first-hour.md",
     "jobs/panorama.md",
@@ -35,7 +35,7 @@ fn read(path: &Path) -> String {
     fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }
 
-/// The fenced blocks of a page: what stands behind the fence, and the text.
+/// Returns the fenced blocks of a page: the info string and the text.
 fn blocks(page: &str) -> Vec<(String, String)> {
     let mut blocks = Vec::new();
     let mut lines = page.lines();
@@ -48,7 +48,7 @@ fn blocks(page: &str) -> Vec<(String, String)> {
     blocks
 }
 
-/// Runs a block in a shell in which `cv` is this program. Gives back the exit code and stderr.
+/// Runs a block in a shell in which `cv` is this program. Returns the exit code and stderr.
 fn shell(folder: &Path, text: &str) -> (Option<i32>, String) {
     let program = Path::new(env!("CARGO_BIN_EXE_cv")).parent().unwrap().to_owned();
     let path = std::env::var_os("PATH").unwrap_or_default();
@@ -64,7 +64,7 @@ fn shell(folder: &Path, text: &str) -> (Option<i32>, String) {
 }
 
 #[test]
-fn every_command_of_the_guides_does_what_they_say() {
+fn every_command_of_the_guides_succeeds_with_the_stated_outputs() {
     let folder = tempfile::tempdir().unwrap();
     let mut commands = 0;
     for guide in GUIDES {
@@ -81,7 +81,7 @@ fn every_command_of_the_guides_does_what_they_say() {
                 assert!(!said.contains("warning: "), "{guide}:\n{text}\n{said}");
                 continue;
             }
-            // What is said stands in the block behind it.
+            // The expected message is in the next block.
             let promised = &blocks[i + 1];
             assert_eq!((code, promised.0.as_str()), (Some(1), "text"), "{guide}:\n{text}\n{said}");
             assert!(said.contains(promised.1.trim()), "{guide}:\n{text}\n{said}");
@@ -106,7 +106,7 @@ fn every_command_of_the_guides_does_what_they_say() {
 }
 
 #[test]
-fn every_link_and_picture_of_the_guides_is_there() {
+fn every_link_and_image_of_the_guides_exists() {
     let docs = root().join("docs");
     let architecture = ["architecture.md", "benchmarks.md", "real-data.md"].map(|name| docs.join(name));
     let pages: Vec<PathBuf> =
@@ -126,7 +126,7 @@ fn every_link_and_picture_of_the_guides_is_there() {
         }
     }
     assert!(links >= 30, "{links} links: guides have gone");
-    // Nobody finds a page or a picture that nothing leads to, and pictures must not grow the repository.
+    // Every page and image must be linked, and the images' total size is limited.
     let mut bytes = 0;
     for folder in ["", "jobs", "pictures"] {
         for file in
@@ -140,7 +140,7 @@ fn every_link_and_picture_of_the_guides_is_there() {
     assert!(read(&root().join("README.md")).lines().count() < 200);
 }
 
-/// The Rust sources below a folder, without tests from outside, as one text.
+/// Returns the Rust sources below a folder, without integration tests, as one text.
 fn sources(folder: &Path, text: &mut String) {
     for entry in fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
         if entry.is_dir() && !entry.ends_with("tests") {
@@ -152,7 +152,7 @@ fn sources(folder: &Path, text: &mut String) {
 }
 
 #[test]
-fn the_messages_in_the_guide_to_failures_are_those_of_the_program() {
+fn the_messages_in_the_guide_to_failures_are_printed_by_the_program() {
     let mut code = String::new();
     sources(&root().join("crates"), &mut code);
     let page = read(&root().join("docs/when-it-fails.md"));
@@ -167,7 +167,7 @@ fn the_messages_in_the_guide_to_failures_are_those_of_the_program() {
 }
 
 #[test]
-fn the_options_in_the_tables_are_there() {
+fn the_options_in_the_tables_exist() {
     let folder = tempfile::tempdir().unwrap();
     let help: String = [
         "demo",

@@ -1,4 +1,4 @@
-//! How photographs are named: files, folders and patterns, in every command.
+//! Input photographs as files, folders and patterns, in every command.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -8,8 +8,8 @@ use std::fs;
 use support::{JOBS, done, fixture, run, strs};
 
 #[test]
-fn folders_and_patterns_stand_for_photographs_in_every_command() {
-    // Frames of a rig are named apart: `depth` takes two folders and gives a map of each pair.
+fn every_command_expands_folders_and_patterns() {
+    // `depth` takes two folders of a rig's frames and writes a map of each pair.
     for job in JOBS.iter().filter(|job| job.name != "depth") {
         let (folder, inputs) = job.folder();
         done(folder.path(), &strs(&job.args(&inputs)));
@@ -37,7 +37,7 @@ fn folders_and_patterns_stand_for_photographs_in_every_command() {
 }
 
 #[test]
-fn more_photographs_than_a_command_takes_are_answered_by_what_to_do() {
+fn too_many_photographs_are_refused_with_a_remedy() {
     let folder = tempfile::tempdir().unwrap();
     for name in ["a.jpg", "b.jpg", "c.jpg"] {
         fs::copy(fixture("two-view/a.jpg"), folder.path().join(name)).unwrap();
@@ -66,7 +66,7 @@ fn more_photographs_than_a_command_takes_are_answered_by_what_to_do() {
 }
 
 #[test]
-fn the_output_is_named_by_the_same_option_everywhere() {
+fn every_command_names_its_output_by_the_same_option() {
     let folder = tempfile::tempdir().unwrap();
     let commands: [&[&str]; 10] = [
         &["demo"],
@@ -81,7 +81,7 @@ fn the_output_is_named_by_the_same_option_everywhere() {
         &["man"],
     ];
     for command in commands {
-        // An option that is not known is wrong usage, help or not.
+        // An unknown option is wrong usage, also with --help.
         let unknown = run(folder.path(), &[command, &["--outptu", "x", "--help"][..]].concat());
         assert_eq!(unknown.code, Some(2), "{command:?}: {unknown:?}");
         for option in ["-o", "--output"] {

@@ -1,4 +1,4 @@
-//! `cv match` from outside: every kind of features against the known geometry of generated pairs, guided matching, and features that go to files and back.
+//! `cv match` as a black box: every kind of features against the known geometry of generated pairs, guided matching, and saved features.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -11,11 +11,11 @@ use std::{
 };
 use support::{done, fixture, json, refused, run};
 
-/// A folder with the two pictures of a fixture as `a.jpg` and `b.jpg`, and its truth.
+/// Creates a folder with the two images of a fixture as `a.jpg` and `b.jpg`; also returns its ground truth.
 fn pair(name: &str) -> (tempfile::TempDir, serde_json::Value) {
     let folder = tempfile::tempdir().unwrap();
-    for picture in ["a.jpg", "b.jpg"] {
-        fs::copy(fixture(&format!("{name}/{picture}")), folder.path().join(picture)).unwrap();
+    for photo in ["a.jpg", "b.jpg"] {
+        fs::copy(fixture(&format!("{name}/{photo}")), folder.path().join(photo)).unwrap();
     }
     let truth = fs::read_to_string(fixture(&format!("oracle/{name}.json"))).unwrap();
     (folder, serde_json::from_str(&truth).unwrap())
@@ -25,14 +25,14 @@ fn matrix(value: &serde_json::Value) -> Matrix3<f64> {
     Matrix3::from_fn(|i, j| value[i][j].as_f64().unwrap())
 }
 
-/// The rows of a matches file: x1 y1 x2 y2 score.
+/// Reads the rows of a matches file: x1 y1 x2 y2 score.
 fn rows(file: &Path) -> Vec<Vec<f64>> {
     let text = fs::read_to_string(file).unwrap();
     let lines = text.lines().filter(|line| !line.starts_with('#'));
     lines.map(|line| line.split_whitespace().map(|number| number.parse().unwrap()).collect()).collect()
 }
 
-/// The number of rows, and of those within `limit` pixels of where the homography takes the first point.
+/// Returns the number of rows, and of those with a transfer error of at most `limit` pixels.
 fn along(rows: &[Vec<f64>], homography: &Matrix3<f64>, limit: f64) -> (usize, usize) {
     let off = |row: &Vec<f64>| {
         let p = homography * Vector3::new(row[0], row[1], 1.0);
@@ -42,7 +42,7 @@ fn along(rows: &[Vec<f64>], homography: &Matrix3<f64>, limit: f64) -> (usize, us
 }
 
 #[test]
-fn every_kind_of_features_follows_the_plane() {
+fn matches_of_every_feature_kind_agree_with_the_homography_of_a_plane() {
     let (folder, truth) = pair("plane");
     let homography = matrix(&truth["homography"]);
     for kind in [
@@ -58,30 +58,30 @@ fn every_kind_of_features_follows_the_plane() {
     ] {
         let args: Vec<&str> = ["match", "a.jpg", "b.jpg", "-o", "m.txt"].into_iter().chain(kind.split(' ')).collect();
         let result = json(folder.path(), &args);
-        // A tentative match may be wrong, but of a plane that is turned by a tenth of a radian most are right: to 3 px, the common threshold of
+        // Tentative matches have outliers, but on a plane rotated by 0.1 rad most are inliers to 3 px, the usual threshold of
         // a homography.
         let (all, good) = along(&rows(&folder.path().join("m.txt")), &homography, 3.0);
         assert_eq!(result["matches"].as_u64().unwrap(), all as u64);
         assert!(all >= 100 && good * 10 >= all * 8, "{kind}: {good} of {all}");
-        // Every point that was found is described, left out, or beyond the limit.
+        // Every detected point is described, dropped, or beyond the limit.
         for i in 0..2 {
             let count = |key: &str| result[key][i].as_u64().unwrap();
             let accounted = count("features") + count("dropped") + count("beyond_limit");
-            // Slanted views add features that no detector of the upright view found.
+            // ASIFT adds features of the simulated views.
             assert!(count("found") == accounted || kind.contains("slanted"), "{kind}: {result}");
         }
     }
 }
 
 #[test]
-fn guided_matching_finds_more_and_leaves_out_what_disagrees() {
+fn guided_matching_adds_inliers_and_removes_outliers() {
     let (folder, truth) = pair("plane");
     let homography = matrix(&truth["homography"]);
     let file = folder.path().join("m.txt");
     done(folder.path(), &["match", "a.jpg", "b.jpg", "-o", "m.txt"]);
     let (_, plain) = along(&rows(&file), &homography, 3.0);
     done(folder.path(), &["match", "a.jpg", "b.jpg", "-o", "m.txt", "--guided", "homography"]);
-    // Within the 3 px of the estimate, and the little that the estimate is off.
+    // Within the 3 px of the estimate, plus the error of the estimate.
     let (all, guided) = along(&rows(&file), &homography, 3.5);
     assert!(guided == all && guided >= plain, "{guided} of {all}, {plain} before");
 
@@ -92,7 +92,7 @@ fn guided_matching_finds_more_and_leaves_out_what_disagrees() {
     let back = Matrix3::new(1.0 / f, 0.0, -center[0] / f, 0.0, 1.0 / f, -center[1] / f, 0.0, 0.0, 1.0);
     let t = Vector3::from_fn(|i, _| truth["translation_m"][i].as_f64().unwrap());
     let fundamental = back.transpose() * t.cross_matrix() * matrix(&truth["rotation"]) * back;
-    // Sampson's distance (Hartley & Zisserman, 11.9).
+    // Sampson distance (Hartley & Zisserman, 11.9).
     let off = |row: &Vec<f64>| {
         let (a, b) = (Vector3::new(row[0], row[1], 1.0), Vector3::new(row[2], row[3], 1.0));
         let (l, m) = (fundamental * a, fundamental.transpose() * b);
@@ -110,11 +110,11 @@ fn guided_matching_finds_more_and_leaves_out_what_disagrees() {
 }
 
 #[test]
-fn photographs_of_different_things_have_no_model() {
+fn unrelated_photographs_have_no_model() {
     let (folder, _) = pair("plane");
     let (other, _) = pair("two-view");
     fs::copy(other.path().join("b.jpg"), folder.path().join("other.jpg")).unwrap();
-    // What matches there are agree on nothing, and that is said.
+    // The tentative matches have no common model, and a warning says so.
     let ran = done(folder.path(), &["match", "a.jpg", "other.jpg", "-o", "m.txt"]);
     assert!(ran.stderr.contains("no homography or fundamental matrix explains"), "{ran:?}");
     let value = json(folder.path(), &["match", "a.jpg", "other.jpg", "-o", "m.txt"]);
@@ -123,7 +123,7 @@ fn photographs_of_different_things_have_no_model() {
     assert!(
         value["model"] == "homography" && 2 * value["agree"].as_u64().unwrap() > value["matches"].as_u64().unwrap()
     );
-    // Nor is anything guided by it, or made of it.
+    // Guided matching and `cv estimate` are refused.
     for model in ["homography", "fundamental"] {
         let ran = refused(folder.path(), &["match", "a.jpg", "other.jpg", "-o", "guided.txt", "--guided", model]);
         assert!(
@@ -137,7 +137,7 @@ fn photographs_of_different_things_have_no_model() {
 }
 
 #[test]
-fn features_go_to_files_and_back() {
+fn saved_features_give_the_same_matches() {
     let (folder, _) = pair("plane");
     let at = |name: &str| -> PathBuf { folder.path().join(name) };
     for (kind, file) in [("sift", "a.rootsift.npy"), ("mops", "a.mops.npy"), ("harris", "a.patch.npy")] {
@@ -149,7 +149,7 @@ fn features_go_to_files_and_back() {
         assert_eq!(saved["matches"], loaded["matches"]);
         assert_eq!(fs::read(at("m.txt")).unwrap(), fs::read(at("again.txt")).unwrap(), "{kind}");
     }
-    // COLMAP's text rounds descriptors to bytes and positions to what it prints: nearly the same matches.
+    // COLMAP's text format rounds descriptors to bytes and positions to the printed digits: nearly the same matches.
     for photo in ["a", "b"] {
         fs::remove_file(at("sift").join(format!("{photo}.keypoints.npy"))).unwrap();
     }
@@ -160,7 +160,7 @@ fn features_go_to_files_and_back() {
 }
 
 #[test]
-fn features_that_do_not_fit_are_refused() {
+fn incompatible_feature_files_are_refused() {
     let (folder, _) = pair("plane");
     let at = |name: &str| -> PathBuf { folder.path().join(name) };
     for kind in ["mops", "harris"] {
@@ -172,7 +172,7 @@ fn features_that_do_not_fit_are_refused() {
     let take = |from: &str, to: &str| fs::copy(at(from), at("mixed").join(to)).unwrap();
     take("mops/a.keypoints.npy", "a.keypoints.npy");
     assert!(refused(folder.path(), &load).stderr.contains("no descriptors beside"));
-    // One photograph's of one kind, the other's of another.
+    // Features of different kinds.
     take("mops/a.mops.npy", "a.mops.npy");
     take("harris/b.keypoints.npy", "b.keypoints.npy");
     take("harris/b.patch.npy", "b.patch.npy");
@@ -182,7 +182,7 @@ fn features_that_do_not_fit_are_refused() {
     take("mops/b.mops.npy", "b.mops.npy");
     let error = refused(folder.path(), &load).stderr;
     assert!(error.contains("keypoints") && error.contains("are not "), "{error}");
-    // A file that ends too soon.
+    // A truncated file.
     let whole = fs::read(at("mops/b.mops.npy")).unwrap();
     take("mops/b.keypoints.npy", "b.keypoints.npy");
     fs::write(at("mixed/b.mops.npy"), &whole[..whole.len() / 2]).unwrap();
@@ -190,7 +190,7 @@ fn features_that_do_not_fit_are_refused() {
 }
 
 #[test]
-fn the_report_counts_what_was_left_out() {
+fn the_report_counts_dropped_features() {
     let (folder, _) = pair("plane");
     let args = ["match", "a.jpg", "b.jpg", "--features", "harris", "--report", "out"];
     let result = json(folder.path(), &args);

@@ -1,4 +1,4 @@
-//! Photographs in, photographs out: their depth of bits, EXIF and color profiles.
+//! Bit depth, EXIF and color profiles from input to output.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -9,7 +9,7 @@ use cv_io::{DynImage, Pixels, read_image};
 use std::{fs, path::Path};
 use support::{done, fixture, json};
 
-/// An EXIF block, little-endian: maker, turn and a comment; then a thumbnail.
+/// Returns a little-endian EXIF block: maker, orientation and a comment; then a thumbnail.
 fn exif(orientation: u8) -> Vec<u8> {
     let entry = |tag: u16, kind: u16, count: u32, value: [u8; 4]| {
         [&tag.to_le_bytes()[..], &kind.to_le_bytes(), &count.to_le_bytes(), &value].concat()
@@ -30,7 +30,7 @@ fn exif(orientation: u8) -> Vec<u8> {
     block
 }
 
-/// What stands for a color profile: a header that says RGB, and `id`.
+/// Returns a minimal color profile: a header of an RGB profile with `id`.
 fn profile(id: u8) -> Vec<u8> {
     let mut profile = vec![id; 200];
     profile[16..20].copy_from_slice(b"RGB ");
@@ -60,7 +60,7 @@ fn write_deep_png(path: &Path, image: &Image<u16, 3>) {
     fs::write(path, bytes).unwrap();
 }
 
-/// The EXIF of a result is that of the original, less the turn and the thumbnail, and has the result's size.
+/// The EXIF of a result is that of the original without orientation and thumbnail, and has the result's size.
 fn check_exif(path: &Path) -> DynImage {
     let image = read_image(path).unwrap();
     assert_eq!((image.exif.camera.as_deref(), image.exif.orientation), (Some("Testmaker"), 1), "{}", path.display());
@@ -84,7 +84,7 @@ const CAMERA: &str = "schema: cv-camera/1\nwidth: 200\nheight: 150\nfx: 150\nfy:
     distortion: radial\ncoefficients: [-0.1, 0.01]\n";
 
 #[test]
-fn sixteen_bits_stay_sixteen_and_what_the_file_says_stays() {
+fn bit_depth_and_metadata_are_preserved() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     fs::write(at("rig.yaml"), RIG).unwrap();
@@ -98,20 +98,20 @@ fn sixteen_bits_stay_sixteen_and_what_the_file_says_stays() {
         let image = check_exif(&at(name));
         assert_eq!(image.metadata.icc, Some(profile(7)));
         let Pixels::Rgb16(image) = image.pixels else { panic!("16 bits") };
-        // The lens bends the ramp by a few pixels; interpolation between pixels is exact on a ramp but for rounding.
+        // The distortion displaces the ramp by a few pixels; interpolation on a ramp is exact up to rounding.
         let [red, green, blue] = image.at(100, 75);
         assert!(red.abs_diff(20_000 + 100 * 13 + 75 * 7) < 20 && green.abs_diff(30_100) < 2 && blue == 40_000);
         let steps = image.row(75).chunks_exact(3).map(|p| p[0]).collect::<std::collections::BTreeSet<_>>();
         assert!(steps.len() > 150, "{} values in a row", steps.len());
     }
-    // A TIFF stays a TIFF.
+    // The output format is that of the input.
     let metadata = read_image(at("a.png")).unwrap().metadata;
     cv_io::write_image(at("deep.tif"), deep.view(), &metadata).unwrap();
     fs::write(at("camera.yaml"), CAMERA).unwrap();
     done(folder.path(), &["undistort", "deep.tif", "--camera", "camera.yaml", "-o", "straight"]);
     let image = check_exif(&at("straight/deep.tif"));
     assert!(matches!(image.pixels, Pixels::Rgb16(_)) && image.metadata.icc == Some(profile(7)));
-    // Bytes stay bytes; a photograph on its side is turned once.
+    // 8-bit images stay 8-bit; the orientation is applied once.
     let bytes = RgbU8::from_fn(150, 200, |x, y| [x as u8, y as u8, 90]);
     for name in ["a.jpg", "b.jpg"] {
         write_jpeg(&at(name), &bytes, 6, 9);
@@ -137,10 +137,10 @@ fn a_panorama_has_the_exif_of_one_photograph_and_the_profile_of_all() {
 }
 
 #[test]
-fn a_panorama_of_sixteen_bits_has_sixteen_bits_and_what_the_files_say() {
+fn a_16_bit_panorama_has_16_bits_and_the_metadata_of_its_photographs() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
-    // The lowest bits say what no rounding to bytes keeps: a ramp over two levels.
+    // A ramp over two 8-bit levels is lost if an intermediate image has 8 bits.
     let deepened = |v: u8, x: usize| 257 * u16::from(v).min(240) + 2 * x as u16;
     for i in 0..2 {
         let view = cv_io::read_rgb(fixture(&format!("panorama/view{i}.jpg"))).unwrap();
@@ -163,15 +163,15 @@ fn a_panorama_of_sixteen_bits_has_sixteen_bits_and_what_the_files_say() {
         let value = json(folder.path(), &["panorama", photos[0], photos[1], "-o", output, "--exposure", "none"]);
         assert_eq!(value["bits"], 16);
         let image = if output == "mixed.tif" { read_image(at(output)).unwrap() } else { check_exif(&at(output)) };
-        // The reference of the mixed ones is that without a profile.
+        // The reference photograph of the mixed set has no profile.
         assert_eq!(image.metadata.icc, (output != "mixed.tif").then(|| profile(7)), "{output}");
         let Pixels::Rgb16(image) = image.pixels else { panic!("16 bits") };
         assert_eq!(image.size(), bytes.size());
         let pairs = || image.as_slice().iter().zip(bytes.as_slice());
-        // Rounding to bytes before and after is worth a level at the most, but where features or a seam lie elsewhere for it.
+        // Rounding to bytes changes at most one level, except where features or a seam differ.
         let far = pairs().filter(|(deep, byte)| (f64::from(**deep) / 257.0 - f64::from(**byte)).abs() > 1.5).count();
         assert!(far * 500 < bytes.as_slice().len(), "{output}: {far}");
-        // What bytes can hold are multiples of 257: by chance one sample in as many.
+        // Values of 8-bit images are multiples of 257: by chance one sample in 257.
         let coarse = image.as_slice().iter().filter(|v| **v > 0 && **v % 257 == 0).count();
         assert!(output == "mixed.tif" || coarse * 50 < bytes.as_slice().len(), "{output}: {coarse}");
     }

@@ -1,4 +1,4 @@
-//! What commands write: whole or not at all, the same on any number of threads, and nothing besides.
+//! Outputs of commands: complete or not written at all, the same with any number of threads, and no other files.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -16,7 +16,7 @@ fn json_is_one_object_and_stdout_is_empty_without_it() {
         let seconds = value["seconds"].as_object().unwrap();
         let total = seconds["total"].as_f64().unwrap();
         let stages: f64 = seconds.iter().filter(|(name, _)| *name != "total").map(|(_, s)| s.as_f64().unwrap()).sum();
-        // Stages are parts of the whole; 1 % for the clock being read at slightly different moments.
+        // Stages are parts of the total; 1 % for the time between clock readings.
         assert!(stages <= 1.01 * total, "{}: {seconds:?}", job.name);
         let ran = done(folder.path(), &strs(&args));
         assert_eq!(ran.stdout, "", "{}", job.name);
@@ -27,7 +27,7 @@ fn json_is_one_object_and_stdout_is_empty_without_it() {
 }
 
 #[test]
-fn threads_change_neither_the_files_nor_the_figures() {
+fn the_thread_count_changes_neither_files_nor_figures() {
     for job in JOBS {
         let (folder, inputs) = job.folder();
         let results = ["1", "2", "3"].map(|threads| {
@@ -63,7 +63,7 @@ fn the_same_seed_gives_the_same_files() {
 }
 
 #[test]
-fn inputs_stay_as_they_are_and_only_outputs_appear() {
+fn inputs_are_unchanged_and_only_outputs_are_created() {
     for job in JOBS {
         let (folder, inputs) = job.folder();
         let before = snapshot(folder.path());
@@ -78,7 +78,7 @@ fn inputs_stay_as_they_are_and_only_outputs_appear() {
 }
 
 #[test]
-fn an_output_that_cannot_be_written_is_told_before_the_work() {
+fn an_unwritable_output_is_reported_before_the_computation() {
     for job in JOBS {
         for output in job.files() {
             let (folder, inputs) = job.folder();
@@ -97,7 +97,7 @@ fn an_output_that_cannot_be_written_is_told_before_the_work() {
     }
 }
 
-/// The arguments of a job with its outputs in a folder `new/deep` that is not there.
+/// Returns the arguments of a job with its outputs in a folder `new/deep` that does not exist.
 fn in_new_folder(args: &[String], outputs: &[&str]) -> Vec<String> {
     let moved = |word: &String| match outputs.iter().any(|output| output.trim_end_matches('/') == word) {
         true => format!("new/deep/{word}"),
@@ -107,7 +107,7 @@ fn in_new_folder(args: &[String], outputs: &[&str]) -> Vec<String> {
 }
 
 #[test]
-fn folders_of_outputs_are_made_by_a_job_that_succeeds_and_by_no_other() {
+fn output_folders_are_created_only_by_successful_runs() {
     for job in JOBS {
         let (folder, inputs) = job.folder();
         let args = in_new_folder(&job.args(&inputs), job.outputs);
@@ -124,7 +124,7 @@ fn folders_of_outputs_are_made_by_a_job_that_succeeds_and_by_no_other() {
 }
 
 #[test]
-fn endings_that_tell_no_format_are_refused_before_the_work() {
+fn unknown_file_extensions_are_refused_before_the_computation() {
     for job in JOBS {
         for output in job.files() {
             let (folder, inputs) = job.folder();
@@ -144,7 +144,7 @@ fn endings_that_tell_no_format_are_refused_before_the_work() {
 }
 
 #[test]
-fn one_file_may_go_to_stdout() {
+fn one_output_may_be_stdout() {
     for job in JOBS {
         let (folder, inputs) = job.folder();
         let args = job.args(&inputs);
@@ -176,13 +176,13 @@ fn one_file_may_go_to_stdout() {
 
 #[cfg(unix)]
 #[test]
-fn a_device_takes_what_a_file_would() {
+fn outputs_may_be_devices() {
     for (job, outputs) in [(&JOBS[0], ["d.pfm", "cloud.ply"]), (&JOBS[3], ["cloud.ply", "cloud.ply"])] {
         let (folder, inputs) = job.folder();
         let args = job.args(&inputs).into_iter();
         let args: Vec<String> =
             args.map(|word| if outputs.contains(&&word[..]) { "/dev/null".to_owned() } else { word }).collect();
-        // Two outputs of one name are refused, whatever it is.
+        // Two outputs of one name are refused, also for devices.
         let code = if outputs[0] == outputs[1] { 0 } else { 2 };
         assert_eq!(run(folder.path(), &strs(&args)).code, Some(code), "{}", job.name);
     }
@@ -191,7 +191,7 @@ fn a_device_takes_what_a_file_would() {
 
 #[cfg(unix)]
 #[test]
-fn a_read_only_folder_is_refused_and_nothing_appears_in_it() {
+fn a_read_only_folder_is_refused_and_stays_unchanged() {
     use std::os::unix::fs::PermissionsExt;
     for job in JOBS {
         for output in job.files() {
@@ -209,7 +209,7 @@ fn a_read_only_folder_is_refused_and_nothing_appears_in_it() {
 }
 
 #[test]
-fn a_failure_keeps_the_outputs_of_the_run_before() {
+fn a_failed_run_keeps_the_outputs_of_the_previous_one() {
     for job in JOBS {
         let (folder, inputs) = job.folder();
         done(folder.path(), &strs(&job.args(&inputs)));
@@ -222,9 +222,9 @@ fn a_failure_keeps_the_outputs_of_the_run_before() {
     }
 }
 
-/// Kills runs at moments spread over their whole duration.
+/// Kills runs at times spread over their whole duration.
 #[test]
-fn a_killed_run_leaves_old_or_new_outputs_and_never_half_of_one() {
+fn a_killed_run_leaves_no_incomplete_output() {
     const MOMENTS: u32 = 8;
     for job in JOBS.iter().filter(|job| !job.files().is_empty()) {
         let (folder, inputs) = job.folder();
@@ -239,14 +239,14 @@ fn a_killed_run_leaves_old_or_new_outputs_and_never_half_of_one() {
             }
             let mut child = cv(folder.path()).args(&args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
             std::thread::sleep(whole * moment / (MOMENTS - 2));
-            // It may have ended by itself.
+            // The run may have ended before.
             let _ = child.kill();
             child.wait().unwrap();
             for (written, new) in job.written(folder.path()).iter().zip(&new) {
                 assert!(written == b"old" || written == new, "{} after {:?}", job.name, whole * moment / MOMENTS);
             }
         }
-        // A later run sweeps up what the killed ones may have left.
+        // A later run removes the temporary files of killed ones.
         done(folder.path(), &strs(&args));
         let left = fs::read_dir(folder.path()).unwrap().flatten();
         assert_eq!(left.filter(|e| e.file_name().to_string_lossy().starts_with(".cv-")).count(), 0, "{}", job.name);
@@ -254,7 +254,7 @@ fn a_killed_run_leaves_old_or_new_outputs_and_never_half_of_one() {
 }
 
 #[test]
-fn the_report_is_one_file_that_needs_no_network() {
+fn the_report_is_a_single_file_without_external_references() {
     for job in JOBS {
         let (folder, inputs) = job.folder();
         let args = job.args(&inputs);
@@ -266,17 +266,17 @@ fn the_report_is_one_file_that_needs_no_network() {
         for outside in ["src=\"http", "href=\"http", "@import", "src=\"//"] {
             assert!(!html.contains(outside), "{}: {outside}", job.name);
         }
-        assert!(html.contains("data:image/") || html.contains("<svg"), "{}: no pictures", job.name);
+        assert!(html.contains("data:image/") || html.contains("<svg"), "{}: no images", job.name);
     }
 }
 
 #[test]
-fn two_photographs_that_would_become_one_output_are_wrong_usage() {
+fn two_photographs_with_the_same_output_name_are_wrong_usage() {
     let folder = tempfile::tempdir().unwrap();
     for name in ["a/same.png", "b/same.jpg"] {
         let path = folder.path().join(name);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
-        // Never read: the names are judged first.
+        // The file is never read: the names are checked first.
         fs::write(path, "").unwrap();
     }
     for command in [&["undistort", "--camera", "none.yaml"][..], &["segment", "predict", "--model", "none.json"]] {

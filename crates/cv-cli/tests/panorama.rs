@@ -1,4 +1,4 @@
-//! `cv panorama` from outside: what its options change in the file.
+//! `cv panorama` as a black box: the effect of its options.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -37,21 +37,21 @@ fn alpha_is_transparent_where_no_photograph_reaches() {
             other => panic!("neither there nor not there: {other:?}"),
         }
     }
-    // A cylinder bends the upper and lower edges of photographs: some of the box around them is empty, most is not.
+    // A cylinder bends the upper and lower edges of photographs: some of the bounding box is empty, most is covered.
     assert!(clear > 100 && 4 * clear < plain.width() * plain.height(), "{clear}");
     assert_eq!(run(folder.path(), &strs(&args(&["-o", "pano.jpg", "--alpha"]))).code, Some(2));
     assert!(!folder.path().join("pano.jpg").exists());
 }
 
 #[test]
-fn an_exr_has_the_light_in_the_exposure_of_the_reference() {
+fn an_exr_has_the_radiance_at_the_exposure_of_the_reference() {
     let folder = tempfile::tempdir().unwrap();
     let (_, names) = landscape(folder.path(), 2, 1.0);
     let value = json(folder.path(), &["panorama", &names[0], &names[1], "-o", "light.exr", "--scale", "0.5"]);
     assert_eq!(value["bits"], 32);
     let bytes = std::fs::read(folder.path().join("light.exr")).unwrap();
     assert_eq!(bytes[..8], [0x76, 0x2f, 0x31, 0x01, 2, 0, 0, 0]);
-    // The window: from (0, 0) to the last pixel.
+    // The crop: from (0, 0) to the last pixel.
     let place = bytes.windows(17).position(|w| w == b"dataWindow\0box2i\0").unwrap() + 17 + 4;
     let side = |k: usize| i32::from_le_bytes(bytes[place + 4 * k..][..4].try_into().unwrap());
     let size = [0, 1].map(|i| value["size"][i].as_i64().unwrap());
@@ -60,7 +60,7 @@ fn an_exr_has_the_light_in_the_exposure_of_the_reference() {
 }
 
 #[test]
-fn a_photograph_on_its_side_changes_nothing() {
+fn exif_orientation_does_not_change_the_panorama() {
     let folder = tempfile::tempdir().unwrap();
     let mut sizes = Vec::new();
     for turned in [None, Some(0), Some(1), Some(2)] {
@@ -78,16 +78,16 @@ fn a_photograph_on_its_side_changes_nothing() {
         assert!(value["images"].as_array().unwrap().iter().all(|image| image["used"] == true), "{value}");
         sizes.push([0, 1].map(|i| value["size"][i].as_f64().unwrap()));
     }
-    // The features of a photograph and of the same on its side differ a little, and so does where the horizon is put.
+    // The features of a photograph and of its rotated copy differ a little, and so does the horizon.
     for size in &sizes[1..] {
         assert!((0..2).all(|i| (size[i] / sizes[0][i] - 1.0).abs() < 0.05), "{sizes:?}");
     }
 }
 
 #[test]
-fn the_mode_is_taken_told_and_checked() {
+fn the_mode_is_applied_reported_and_validated() {
     let folder = tempfile::tempdir().unwrap();
-    // One flat picture, two parts of it: what a camera shows that was slid along a wall.
+    // Two crops of one planar image: a camera translated along a wall.
     let wall = cv_io::read_rgb(fixture("panorama/view1.jpg")).unwrap();
     let (w, h) = wall.size();
     let wide = 2 * w / 3;
@@ -99,14 +99,14 @@ fn the_mode_is_taken_told_and_checked() {
     let value = told("plane");
     assert_eq!((value["mode"].as_str(), value["projection"].as_str()), (Some("plane"), Some("plane")));
     let size = [0, 1].map(|i| value["size"][i].as_f64().unwrap());
-    // The wall again: half a per cent for what matches of a tenth of a pixel leave of its frame.
+    // The wall again: half a percent of tolerance for matches with errors of a tenth of a pixel.
     assert!((size[0] / w as f64 - 1.0).abs() < 0.005 && (size[1] / h as f64 - 1.0).abs() < 0.005, "{size:?} {w} {h}");
     assert_eq!(told("rotation")["mode"], "rotation");
     assert_eq!(run(folder.path(), &["panorama", "0.png", "1.png", "-o", "q.png", "--mode", "flat"]).code, Some(2));
 }
 
-/// Photographs of a landscape that is known in every direction, side by side around the direction ahead, as `0.png` … in a folder, and `cam.yaml`, the camera that took them, 420 × 300
-/// pixels at a focal length of 360; `exposure`: how far their exposures differ, in stops.
+/// Renders photographs of a landscape with known radiance, side by side around the forward direction, as `0.png` … in a folder with their camera `cam.yaml` of 420 × 300
+/// pixels and a focal length of 360 px; `exposure`: the range of their exposures in stops.
 fn landscape(folder: &Path, views: usize, exposure: f32) -> (Vista, Vec<String>) {
     let vista = Vista::new(5, 90.0);
     let camera = Camera::from_focal(420, 300, 360.0);
@@ -129,24 +129,24 @@ fn landscape(folder: &Path, views: usize, exposure: f32) -> (Vista, Vec<String>)
     (vista, names)
 }
 
-/// What a camera without faults stores of the light of a direction.
+/// Returns the ideal gray levels of a direction.
 fn level(vista: &Vista, ray: &Vector3<f64>) -> [f64; 3] {
     vista.radiance(ray).map(|light| 255.0 * f64::from(vista_response(light, 0.0)))
 }
 
-/// The direction at a longitude to the right and a latitude above the horizon.
+/// Returns the direction at a longitude to the right and a latitude above the horizon.
 fn direction(longitude: f64, latitude: f64) -> Vector3<f64> {
     Vector3::new(latitude.cos() * longitude.sin(), -latitude.sin(), latitude.cos() * longitude.cos())
 }
 
-/// Mean difference, in gray levels, of a picture from the landscape, where `ray` says what lies at a place of the surface (a radian at its middle is 1, y down) whose middle is that of
-/// the picture; the best of the shifts that alignment to a pixel or two leaves.
-fn difference(picture: &RgbU8, vista: &Vista, ray: impl Fn(f64, f64) -> Vector3<f64>) -> f64 {
-    let (w, h) = picture.size();
+/// Computes the mean difference in gray levels between an image and the landscape; `ray` returns the direction at a position of the surface (one radian at its center is 1, y down, origin at
+/// the image's center). The minimum over shifts of a pixel or two, the accuracy of the alignment.
+fn difference(image: &RgbU8, vista: &Vista, ray: impl Fn(f64, f64) -> Vector3<f64>) -> f64 {
+    let (w, h) = image.size();
     let at = |dx: f64, dy: f64| {
         let (mut sum, mut n) = (0.0, 0);
         for (x, y) in (3..h - 3).step_by(3).flat_map(|y| (3..w - 3).step_by(3).map(move |x| (x, y))) {
-            if picture.at(x, y) == [0; 3] {
+            if image.at(x, y) == [0; 3] {
                 continue;
             }
             let place = |v: f64, size: usize| (v - 0.5 * (size as f64 - 1.0)) / 360.0;
@@ -155,7 +155,7 @@ fn difference(picture: &RgbU8, vista: &Vista, ray: impl Fn(f64, f64) -> Vector3<
                 let light = level(vista, &ray(place(x as f64 + dx + i, w), place(y as f64 + dy + j, h)));
                 (0..3).for_each(|c| truth[c] += 0.25 * light[c]);
             }
-            sum += (0..3).map(|c| (f64::from(picture.at(x, y)[c]) - truth[c]).abs()).sum::<f64>() / 3.0;
+            sum += (0..3).map(|c| (f64::from(image.at(x, y)[c]) - truth[c]).abs()).sum::<f64>() / 3.0;
             n += 1;
         }
         assert!(n > 500, "{n} pixels");
@@ -166,7 +166,7 @@ fn difference(picture: &RgbU8, vista: &Vista, ray: impl Fn(f64, f64) -> Vector3<
 }
 
 #[test]
-fn every_projection_shows_the_part_of_the_scene_that_was_asked_for() {
+fn every_projection_shows_the_requested_field_of_view() {
     let folder = tempfile::tempdir().unwrap();
     let (vista, names) = landscape(folder.path(), 4, 0.0);
     let go = |more: &[&str]| -> RgbU8 {
@@ -185,7 +185,7 @@ fn every_projection_shows_the_part_of_the_scene_that_was_asked_for() {
     };
     let size = |half_w: f64, half_h: f64| ((720.0 * half_w).round() as usize, (720.0 * half_h).round() as usize);
     let tan = |degrees: f64| degrees.to_radians().tan();
-    // Bilinear and cubic interpolation, half-pixel shifts and the seams take a level or two of a texture of ±30; a wrong surface makes it 15.
+    // Interpolation, half-pixel shifts and seams cause an error of one or two levels on a texture of ±30; a false projection one of 15.
     const BAR: f64 = 4.0;
     let p = go(&["--projection", "panini", "--fov", "110,40"]);
     assert_eq!(p.size(), size(2.0 * tan(27.5), tan(20.0)));
@@ -200,12 +200,12 @@ fn every_projection_shows_the_part_of_the_scene_that_was_asked_for() {
     let d = difference(&p, &vista, stereographic);
     assert!(d < BAR, "stereographic: {d}");
 
-    // To the right, upwards, and clockwise: the picture of a camera that was turned so.
+    // To the right, up, and clockwise: the image of a rotated camera.
     let p = go(&["--projection", "plane", "--fov", "40,30", "--center", "-20,6", "--roll", "10"]);
     assert_eq!(p.size(), size(tan(20.0), tan(15.0)));
     let (yaw, pitch, roll) = (-20_f64.to_radians(), 6_f64.to_radians(), 10_f64.to_radians());
     let turned = |x: f64, y: f64| {
-        // Undo the turn of the picture, then look up, then aside.
+        // The inverse of the image's roll, then pitch, then yaw.
         let (x, y) = (roll.cos() * x + roll.sin() * y, roll.cos() * y - roll.sin() * x);
         let (y, z) = (pitch.cos() * y - pitch.sin(), pitch.sin() * y + pitch.cos());
         Vector3::new(yaw.cos() * x + yaw.sin() * z, y, yaw.cos() * z - yaw.sin() * x)
@@ -215,7 +215,7 @@ fn every_projection_shows_the_part_of_the_scene_that_was_asked_for() {
 }
 
 #[test]
-fn fields_of_view_that_make_no_sense_are_refused_with_their_numbers() {
+fn invalid_fields_of_view_are_refused_with_their_values() {
     let folder = tempfile::tempdir().unwrap();
     let views: Vec<String> =
         (0..3).map(|i| fixture(&format!("panorama/view{i}.jpg")).to_str().unwrap().to_owned()).collect();
@@ -255,7 +255,7 @@ fn the_order_of_the_files_does_not_change_a_byte() {
     let go = |order: &[usize], out: &str, more: &[&str]| {
         let photos: Vec<&str> = order.iter().map(|i| names[*i].as_str()).collect();
         let value = json(folder.path(), &[&["panorama"], &photos[..], &["-o", out, "--scale", "0.7"], more].concat());
-        // Everything is reported in the order of the arguments.
+        // Reports follow the order of the arguments.
         for (image, name) in value["images"].as_array().unwrap().iter().zip(&photos) {
             assert_eq!(image["path"], **name);
             assert_eq!(image["used"], true);
@@ -265,15 +265,15 @@ fn the_order_of_the_files_does_not_change_a_byte() {
     let first = go(&[0, 1, 2, 3], "a.png", &[]);
     assert!(first == go(&[3, 1, 0, 2], "b.png", &["--save-registration", "rig.json"]));
     assert!(first == go(&[2, 0, 3, 1], "c.png", &["--threads", "1"]));
-    // A registration is of the photographs in its own order.
+    // A registration applies to the photographs in its own order.
     assert!(first == go(&[3, 1, 0, 2], "d.png", &["--registration", "rig.json"]));
 }
 
 #[test]
-fn a_saved_registration_gives_the_same_bytes_and_serves_other_frames() {
+fn a_saved_registration_gives_the_same_bytes_and_renders_other_frames() {
     let folder = tempfile::tempdir().unwrap();
     let (_, names) = landscape(folder.path(), 3, 0.0);
-    // A photograph that fits nowhere is part of the set.
+    // An unregistered photograph is part of the set.
     let stranger = RgbU8::from_fn(200, 150, |x, y| [(x * 7 % 251) as u8, (y * 5 % 239) as u8, 90]);
     cv_io::write_png(folder.path().join("stranger.png"), stranger.view()).unwrap();
     let photos: Vec<&str> = strs(&names).into_iter().chain(["stranger.png"]).collect();
@@ -288,7 +288,7 @@ fn a_saved_registration_gives_the_same_bytes_and_serves_other_frames() {
     assert_eq!(again["images"][3]["used"], false);
     assert_eq!(again["images"][1]["focal_px"], first["images"][1]["focal_px"]);
     assert!(again["seconds"]["match"].is_null() && first["seconds"]["match"].is_number());
-    // It says what it holds.
+    // The file states its contents.
     let saved: serde_json::Value = serde_json::from_slice(&bytes("new/rig.json")).unwrap();
     assert_eq!((saved["schema"].as_u64(), saved["mode"].as_str()), (Some(1), Some("rotation")));
     assert_eq!(
@@ -297,7 +297,7 @@ fn a_saved_registration_gives_the_same_bytes_and_serves_other_frames() {
     );
     assert_eq!(saved["photographs"][1]["camera"]["fx"], first["images"][1]["focal_px"]);
 
-    // The same views, each in another exposure: the picture lies where it did, and it is that of those photographs.
+    // The same views with other exposures: the canvas is the same, with the new gray levels.
     let dark = tempfile::tempdir_in(folder.path()).unwrap();
     let (_, darker) = landscape(dark.path(), 3, 0.5);
     let place = dark.path().file_name().unwrap().to_str().unwrap();
@@ -306,14 +306,14 @@ fn a_saved_registration_gives_the_same_bytes_and_serves_other_frames() {
     let other = go(&strs(&darker), &["-o", "c.png", "--registration", "new/rig.json", "--scale", "0.7"]);
     assert_eq!(other["size"], first["size"]);
     assert!(other["images"][0]["gain"] != first["images"][0]["gain"] && bytes("c.png") != bytes("a.png"));
-    // Another part of it, drawn anew.
+    // Another field of view from the same registration.
     let part =
         go(&photos, &["-o", "d.png", "--registration", "new/rig.json", "--projection", "panini", "--fov", "60,30"]);
     assert_eq!(part["projection"], "panini");
 }
 
 #[test]
-fn registrations_of_other_photographs_and_damaged_ones_are_refused() {
+fn registrations_of_other_photographs_and_damaged_registrations_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let (_, names) = landscape(folder.path(), 3, 0.0);
     done(
@@ -363,7 +363,7 @@ fn registrations_of_other_photographs_and_damaged_ones_are_refused() {
         refuse(&photos, name, name);
     }
     refuse(&photos, "missing.json", "missing.json");
-    // What matching would need means nothing here, and nothing that is read is written over.
+    // Options of matching are refused, and no input is overwritten.
     let ran =
         run(folder.path(), &["panorama", "0.png", "-o", "b.png", "--registration", "rig.json", "--mode", "plane"]);
     assert_eq!(ran.code, Some(2), "{ran:?}");
@@ -376,7 +376,7 @@ fn registrations_of_other_photographs_and_damaged_ones_are_refused() {
 }
 
 #[test]
-fn a_project_for_hugin_has_the_views_and_comes_back_as_a_registration() {
+fn a_hugin_project_has_the_views_and_is_read_as_a_registration() {
     let folder = tempfile::tempdir().unwrap();
     let (vista, names) = landscape(folder.path(), 3, 0.0);
     let photos = strs(&names);
@@ -392,26 +392,26 @@ fn a_project_for_hugin_has_the_views_and_comes_back_as_a_registration() {
     };
     for (i, line) in images.iter().enumerate() {
         assert!(line.ends_with(&format!("n\"{i}.png\"")), "{line}");
-        // The camera, of which 420 px across at a focal length of 360 are 60.5 degrees, and the views: side by side 55 % of that apart, as high as the horizon is put.
+        // The camera: 420 px at a focal length of 360 px are 60.5°. The views: spaced by 55 % of that at the height of the horizon.
         let across = 2.0 * (210.0_f64 / 360.0).atan();
         assert!((value(line, "v") - across.to_degrees()).abs() < 1e-9, "{line}");
         let yaw = (i as f64 - 1.0) * 0.55 * across.to_degrees();
-        // Two pixels of alignment.
+        // Two pixels of alignment error.
         assert!((value(line, "y") - yaw).abs() < 0.32 && value(line, "r").abs() < 0.5, "{line}");
     }
     assert_eq!(images.len(), 3);
     let p = text.lines().find(|line| line.starts_with("p ")).unwrap();
     assert!(p.starts_with("p f19 ") && p.contains(" P\"100 0 0\" "), "{p}");
 
-    // Read back it draws the same scene, to what a turn of the world leaves of rounding.
+    // Read back it renders the same scene, up to rounding of the world frame.
     let again = go(&photos, &[&["-o", "b.png", "--registration", "p.pto"], &field[..]].concat());
     assert_eq!(again["size"], first["size"]);
     let panini = |x: f64, y: f64| {
         let longitude = 2.0 * (0.5 * x).atan();
         direction(longitude, -(0.5 * y * (1.0 + longitude.cos())).atan())
     };
-    let picture = cv_io::read_rgb(folder.path().join("b.png")).unwrap();
-    let d = difference(&picture, &vista, panini);
+    let image = cv_io::read_rgb(folder.path().join("b.png")).unwrap();
+    let d = difference(&image, &vista, panini);
     assert!(d < 4.0, "{d}");
 
     std::fs::write(folder.path().join("fish.pto"), text.replace(" f0 ", " f3 ")).unwrap();

@@ -1,4 +1,4 @@
-//! `cv rectify` from outside.
+//! `cv rectify` as a black box.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -9,7 +9,7 @@ use cv_io::RigFile;
 use cv_synth::{RenderOptions, Scene, render};
 use support::{done, json, refused, run, snapshot};
 
-/// Two photographs of a room by a rig whose second camera is turned by a degree or so, and the rig's file.
+/// Renders two photographs of a room by a rig with a second camera rotated by about a degree, and writes the rig's file.
 fn rig(vertical: bool) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let scene = Scene::room(4);
@@ -36,7 +36,7 @@ fn rig(vertical: bool) -> tempfile::TempDir {
 }
 
 #[test]
-fn a_turned_rig_is_rectified_with_a_printed_quality() {
+fn a_rotated_rig_is_rectified_and_its_quality_printed() {
     for vertical in [false, true] {
         let folder = rig(vertical);
         let run = |more: &[&str]| {
@@ -44,7 +44,7 @@ fn a_turned_rig_is_rectified_with_a_printed_quality() {
         };
         let tight = run(&[]);
         assert_eq!(tight["vertical"], vertical);
-        // Features are placed to a few tenths of a pixel; the turn alone moves rows by several pixels.
+        // Features are localized to a few tenths of a pixel; the rotation alone moves rows by several pixels.
         assert!(tight["vertical_residual_px"]["median"].as_f64().unwrap() < 0.5, "{tight}");
         assert_eq!(tight["valid_area"]["left"], 1.0, "{tight}");
         let wide = run(&["--alpha", "1", "--size", "400x300"]);
@@ -59,7 +59,7 @@ fn a_turned_rig_is_rectified_with_a_printed_quality() {
 }
 
 #[test]
-fn rigs_that_are_none_are_refused_and_nothing_is_written() {
+fn invalid_rigs_are_refused_and_nothing_is_written() {
     let folder = rig(false);
     let refuse = |rig: &str, more: &[&str]| {
         refused(folder.path(), &[&["rectify", "a.png", "b.png", "--rig", rig, "--out", "out"], more].concat()).stderr
@@ -76,7 +76,7 @@ fn rigs_that_are_none_are_refused_and_nothing_is_written() {
         );
         assert!(ran.code == Some(2) && ran.stderr.contains(more[0]), "{ran:?}");
     }
-    // The photograph is named, and so is what a file lacks that is a calibration in part.
+    // The message names the photograph, and the missing entry of an incomplete calibration.
     cv_io::write_png(folder.path().join("small.png"), cv_core::RgbU8::new(160, 120, [90; 3]).view()).unwrap();
     for command in [["rectify", "a.png", "small.png", "--out", "out"], ["depth", "a.png", "small.png", "-o", "d.pfm"]] {
         let small = refused(folder.path(), &[&command[..], &["--rig", "rig.yaml"]].concat()).stderr;
@@ -93,13 +93,13 @@ fn rigs_that_are_none_are_refused_and_nothing_is_written() {
 }
 
 #[test]
-fn what_is_read_is_never_written_over() {
+fn inputs_are_never_overwritten() {
     let folder = rig(false);
     std::fs::rename(folder.path().join("a.png"), folder.path().join("left.png")).unwrap();
     std::fs::create_dir(folder.path().join("calibration")).unwrap();
     std::fs::copy(folder.path().join("rig.yaml"), folder.path().join("calibration/rig.yaml")).unwrap();
     let before = snapshot(folder.path());
-    // The photograph in the folder itself; the calibration by another way to its folder.
+    // The input photograph as output; the calibration by another path to its folder.
     for (left, rig, out, named) in [
         ("left.png", "none.yaml", ".", "left.png"),
         ("b.png", "calibration/rig.yaml", "./calibration/../calibration", "rig.yaml"),
@@ -111,24 +111,24 @@ fn what_is_read_is_never_written_over() {
 }
 
 #[test]
-fn photographs_that_do_not_fit_the_rig_are_told_from_those_without_features() {
+fn photographs_inconsistent_with_the_rig_and_without_features_have_different_errors() {
     for vertical in [false, true] {
         let folder = rig(vertical);
         let rectify = |a: &str, b: &str| {
             let ran = run(folder.path(), &["rectify", a, b, "--rig", "rig.yaml", "--out", "out", "--json"]);
             (ran.code, serde_json::from_str::<serde_json::Value>(&ran.stdout).unwrap(), ran.stderr)
         };
-        // In the wrong order: the turn of the cameras moves rows the other way, by twice its five pixels and more.
+        // Swapped photographs: the rotation of the cameras moves rows in the opposite direction, by more than twice its five pixels.
         let (code, value, stderr) = rectify("b.png", "a.png");
         assert_eq!(code, Some(1));
         assert!(stderr.contains("vertical disparity of features") && stderr.contains("in its order"), "{stderr}");
         assert!(value["vertical_residual_px"].is_null() && value["fault"].is_string(), "{value}");
-        // Nothing to see: nothing is known against the calibration.
+        // No features: no evidence against the calibration.
         cv_io::write_png(folder.path().join("flat.png"), cv_core::RgbU8::new(320, 240, [90; 3]).view()).unwrap();
         let (code, value, _) = rectify("flat.png", "flat.png");
         assert!(code == Some(0) && value["vertical_residual_px"].is_null() && value["fault"].is_null(), "{value}");
     }
-    // A rig without any turn, its photographs exchanged: rows fit, disparities are those of a world behind the cameras.
+    // A rig without rotation, its photographs swapped: rows agree, disparities are negative.
     let folder = rig(false);
     let straight = Pose::new(Rotation3::identity(), Vector3::new(-0.25, 0.0, 0.0));
     let camera = Camera::from_focal(320, 240, 280.0);
@@ -144,7 +144,7 @@ fn photographs_that_do_not_fit_the_rig_are_told_from_those_without_features() {
 }
 
 #[test]
-fn the_rig_file_of_the_help_is_one() {
+fn the_rig_file_in_the_help_is_valid() {
     let folder = rig(false);
     let help = done(folder.path(), &["rectify", "--help"]).stdout;
     let file: Vec<&str> = help
@@ -155,11 +155,11 @@ fn the_rig_file_of_the_help_is_one() {
         .collect();
     std::fs::write(folder.path().join("help.yaml"), file.join("\n").replace("\n  ", "\n").trim_start()).unwrap();
     let ran = refused(folder.path(), &["rectify", "a.png", "b.png", "--rig", "help.yaml", "--out", "out"]);
-    // Understood in full: only the size is not that of these photographs.
+    // A valid rig of another image size.
     assert!(ran.stderr.contains("calibrated for 640×480 px"), "{ran:?}");
 }
 
-/// Positions in a binary PLY of colored points.
+/// Reads the positions of a binary PLY of colored points.
 fn positions(path: &std::path::Path) -> Vec<[f64; 3]> {
     let bytes = std::fs::read(path).unwrap();
     let header = b"end_header\n";
@@ -173,7 +173,7 @@ fn positions(path: &std::path::Path) -> Vec<[f64; 3]> {
 }
 
 #[test]
-fn depth_by_a_rig_lies_on_the_scene_in_the_left_camera_s_frame() {
+fn depth_by_a_rig_is_accurate_in_the_left_camera_frame() {
     let camera = Camera::from_focal(320, 240, 280.0);
     for vertical in [false, true] {
         let folder = rig(vertical);
@@ -189,10 +189,10 @@ fn depth_by_a_rig_lies_on_the_scene_in_the_left_camera_s_frame() {
                 let p = camera.project(&cv_core::Point3::new(*x, *y, *z)).unwrap();
                 let (x, y) = (p.x.round(), p.y.round());
                 let seen = x >= 0.0 && y >= 0.0 && x < 320.0 && y < 240.0;
-                // A disparity is good to half a pixel of the fifteen and more that this scene has.
+                // A disparity is accurate to half a pixel, at fifteen pixels and more in this scene.
                 seen && (f64::from(truth.at(x as usize, y as usize)[0]) - z).abs() < 0.04 * z
             });
-            // The rest are outlines of things, a pixel beside them.
+            // The rest are pixels beside depth discontinuities.
             let share = right.count() as f64 / points.len() as f64;
             assert!(share > 0.9 && points.len() > 40_000, "{share} of {}", points.len());
         }
@@ -200,11 +200,11 @@ fn depth_by_a_rig_lies_on_the_scene_in_the_left_camera_s_frame() {
 }
 
 #[test]
-fn depth_by_a_rig_keeps_the_bits_of_the_photographs() {
+fn depth_by_a_rig_uses_the_full_bit_depth() {
     let folder = rig(false);
     let at = |name: &str| folder.path().join(name);
     for name in ["a", "b"] {
-        // All that there is to see is in the lower byte: rounded to 8 bits, these are gray walls.
+        // All texture is in the lower byte: rounded to 8 bits the images are constant.
         let deep = cv_io::read_rgb(at(&format!("{name}.png"))).unwrap().map(|p| p.map(|v| 0x4e00 + u16::from(v)));
         cv_io::write_png(at(&format!("{name}16.png")), deep.view()).unwrap();
     }
@@ -215,7 +215,7 @@ fn depth_by_a_rig_keeps_the_bits_of_the_photographs() {
     };
     let (bytes, deep) = (depth("a.png", "b.png"), depth("a16.png", "b16.png"));
     let near = bytes.as_slice().iter().zip(deep.as_slice()).filter(|(a, b)| (**a - **b).abs() < 1.0).count();
-    // Penalties and smoothing know edges by their height, which is 1/257 of what it was; what is filled in follows from them.
+    // The intensities are 1/257 of the original ones, so that adaptive penalties and edge-preserving smoothing differ, and with them the filling.
     assert!(near * 10 > bytes.as_slice().len() * 8, "{near} of {}", bytes.as_slice().len());
     assert!(std::fs::read_to_string(at("page/report.html")).unwrap().contains("invalid gray"));
     // The size of the rectified photographs is that of `cv rectify --size`.
@@ -226,7 +226,7 @@ fn depth_by_a_rig_keeps_the_bits_of_the_photographs() {
 }
 
 #[test]
-fn a_picture_of_depths_is_in_millimeters_whatever_the_unit_of_the_rig() {
+fn a_depth_png_is_in_millimeters_for_every_unit_of_the_rig() {
     let folder = rig(false);
     let at = |name: &str| folder.path().join(name);
     let in_meters = cv_io::read_rig(at("rig.yaml"), None).unwrap();
@@ -239,7 +239,7 @@ fn a_picture_of_depths_is_in_millimeters_whatever_the_unit_of_the_rig() {
         cv_io::depth_mm::read(at("z.png")).unwrap()
     };
     let (m, mm) = (depth("rig.yaml"), depth("mm.yaml"));
-    // Steps of a millimeter, and rounding to either side of one.
+    // Quantization to a millimeter, with rounding.
     let near = m.as_slice().iter().zip(mm.as_slice()).filter(|(a, b)| (**a - **b).abs() < 0.0015).count();
     assert!(near * 100 > m.as_slice().len() * 99, "{near} of {}", m.as_slice().len());
 }

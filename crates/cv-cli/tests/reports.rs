@@ -1,4 +1,4 @@
-//! Reports in a browser: headless Chromium opens one of each kind, light and dark, as wide as a phone and as a screen.
+//! Reports in a browser: headless Chromium opens one of each kind, light and dark, at the width of a phone and of a screen.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -20,12 +20,11 @@ use support::{done, fixture, run};
 /// Widths of a phone and of a screen, in CSS pixels.
 const WIDTHS: [u32; 2] = [420, 1400];
 
-/// The reports that are looked at in dark mode too.
+/// Reports that are also tested in dark mode.
 const DARK: [&str; 3] = ["depth", "reconstruct", "match"];
 
-/// What every page finds out about itself and tells the test, a while after it has loaded. The errors are those of its
-/// scripts. Clicks go from the middle of the cloud outwards until one
-/// meets a point.
+/// Script in each page that reports its layout and its script errors to the test after loading. It clicks from the center
+/// of the cloud outwards until it hits a point.
 const PROBE: &str = r#"<script>
 const errors = [];
 addEventListener("error", (e) => errors.push(e.message));
@@ -67,14 +66,14 @@ addEventListener("load", () => setTimeout(async () => {
 }, 20));
 </script>"#;
 
-/// The browser: `CHROMIUM`, or `chromium` on the path.
+/// Returns the browser: `CHROMIUM`, or `chromium` on the path.
 fn chromium() -> Option<PathBuf> {
     let given = std::env::var_os("CHROMIUM").map(PathBuf::from);
     let path = std::env::var_os("PATH").unwrap_or_default();
     given.or_else(|| std::env::split_paths(&path).map(|folder| folder.join("chromium")).find(|file| file.is_file()))
 }
 
-/// Answers a browser that asks for a file of the folder, and hands on what it posts.
+/// Serves files of the folder to the browser, and forwards what it posts.
 fn serve(mut stream: TcpStream, folder: &Path, answers: &Sender<Value>) -> Option<()> {
     let mut reader = BufReader::new(stream.try_clone().ok()?);
     let mut line = String::new();
@@ -107,7 +106,7 @@ fn serve(mut stream: TcpStream, folder: &Path, answers: &Sender<Value>) -> Optio
     stream.write_all(&text).ok()
 }
 
-/// Has the browser open `around` and waits for as many answers.
+/// Opens `around` in the browser and waits for the given number of answers.
 fn opened(browser: &Path, folder: &Path, dark: bool, count: usize) -> Vec<Value> {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap();
@@ -131,7 +130,7 @@ fn opened(browser: &Path, folder: &Path, dark: bool, count: usize) -> Vec<Value>
         .stderr(fs::File::create(&log).unwrap())
         .spawn()
         .unwrap();
-    // A machine may be slow; a page that never answers is told from that by half a minute of silence.
+    // Half a minute without an answer is a failure; a slow machine still answers.
     let answers: Vec<Value> = (0..count).map_while(|_| receiver.recv_timeout(Duration::from_secs(30)).ok()).collect();
     let _ = child.kill();
     let _ = child.wait();
@@ -139,7 +138,7 @@ fn opened(browser: &Path, folder: &Path, dark: bool, count: usize) -> Vec<Value>
     answers
 }
 
-/// Makes one report of each kind from the fixtures. Gives back their names.
+/// Writes one report of each kind from the fixtures; returns their names.
 fn make_reports(folder: &Path) -> Vec<&'static str> {
     let at = |name: &str| fixture(name).to_str().unwrap().to_owned();
     let [left, right] = ["stereo/left.jpg", "stereo/right.jpg"].map(at);
@@ -175,7 +174,7 @@ fn make_reports(folder: &Path) -> Vec<&'static str> {
     .to_vec()
 }
 
-/// A page that opens the reports in a frame, one after the other at each width.
+/// Returns a page that opens the reports in a frame, one after the other at each width.
 fn around(names: &[&str], widths: &[u32]) -> String {
     let visits: Vec<(&str, u32)> =
         names.iter().flat_map(|name| widths.iter().map(move |width| (*name, *width))).collect();
@@ -192,7 +191,7 @@ fn around(names: &[&str], widths: &[u32]) -> String {
     )
 }
 
-/// What must hold of every report at every width.
+/// Properties of every report at every width.
 fn check(answer: &Value) {
     assert!(answer["errors"].as_array().unwrap().is_empty(), "{answer}");
     assert!(answer["wide"].as_u64() <= answer["width"].as_u64(), "it scrolls sideways: {answer}");
@@ -213,7 +212,7 @@ fn check(answer: &Value) {
 #[test]
 fn reports_work_in_a_browser() {
     let Some(browser) = chromium() else {
-        // Written past the test harness, which keeps what tests that pass print to itself.
+        // Printed directly, since the test harness captures the output of passing tests.
         let words = "skipped: there is no Chromium (neither CHROMIUM nor chromium on the path): no report was opened";
         writeln!(std::io::stderr(), "{words}").unwrap();
         return;
@@ -226,7 +225,7 @@ fn reports_work_in_a_browser() {
             html.replacen("<head>", &format!("<head>{PROBE}"), 1).replacen("</body>", &format!("{ASK}</body>"), 1);
         fs::write(folder.path().join(format!("{name}.html")), asked).unwrap();
     }
-    // All pages have one style sheet: dark, those with clouds and plots suffice, and the narrow width.
+    // All pages share one style sheet: in dark mode, pages with clouds and plots at the narrow width suffice.
     let runs = [(false, &names[..], &WIDTHS[..]), (true, &DARK[..], &WIDTHS[..1])];
     let answers: Vec<(bool, Vec<Value>)> = std::thread::scope(|scope| {
         let (browser, folder) = (&browser, folder.path());
@@ -237,7 +236,7 @@ fn reports_work_in_a_browser() {
         runs.into_iter().map(|(dark, run)| (dark, run.join().unwrap())).collect()
     });
     answers.iter().flat_map(|(_, answers)| answers).for_each(check);
-    // Dark is dark, in the plots too: no color of the page's is the same in both.
+    // In dark mode every color of the page differs from light mode, plots included.
     for dark in &answers[1].1 {
         let light = answers[0].1.iter().find(|light| light["page"] == dark["page"]).unwrap();
         for color in ["ground", "ink"] {
@@ -247,9 +246,9 @@ fn reports_work_in_a_browser() {
 }
 
 #[test]
-fn a_report_begins_with_the_warnings_of_the_run_and_ends_with_how_it_was_called() {
+fn a_report_starts_with_the_warnings_and_ends_with_the_command_line() {
     let folder = tempfile::tempdir().unwrap();
-    // A third of the pair matches; the rest is noise that the other photograph does not confirm.
+    // A third of the pair matches; the rest is noise without correspondence in the other photograph.
     let noise = |x: usize, y: usize, shift: usize| [(((x + shift) * 7919 + y * 104_729) % 251) as u8; 3];
     for (name, shift) in [("l.png", 0), ("r.png", 3)] {
         let photo = cv_core::RgbU8::from_fn(160, 90, |x, y| {

@@ -1,4 +1,4 @@
-//! `cv segment` from outside.
+//! `cv segment` as a black box.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -8,7 +8,7 @@ use cv_core::{Mask, RgbU8};
 use std::fs;
 use support::{done, json, refused, run};
 
-/// Four pictures of an orange disc on gray with their masks, as files in a new folder.
+/// Writes four images of an orange disc on gray and their masks to a new folder.
 fn discs() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     for part in ["train", "test"] {
@@ -29,7 +29,7 @@ fn discs() -> tempfile::TempDir {
 }
 
 #[test]
-fn trained_predicted_and_scored() {
+fn training_prediction_and_evaluation_of_discs_succeed() {
     let discs = discs();
     let folder = discs.path();
     let train = ["segment", "train", "--images", "train", "--masks", "train", "--model", "m.json"];
@@ -38,7 +38,7 @@ fn trained_predicted_and_scored() {
     assert!(fs::read_to_string(folder.join("r/report.html")).unwrap().contains("Photographs"));
     let scored = json(folder, &["segment", "eval", "--model", "m.json", "--images", "test", "--masks", "test"]);
     for key in ["precision", "recall", "f1"] {
-        // The disc's colors occur nowhere else; smoothing and opening cost a part of its border, 88 of 616 pixels.
+        // The disc's colors are unique; smoothing and opening remove a part of its border, 88 of 616 pixels.
         assert!(scored[key].as_f64().unwrap() > 0.95, "{key}: {scored}");
     }
     assert_eq!(scored["images"][1]["path"], "test/p1.png");
@@ -64,7 +64,7 @@ fn trained_predicted_and_scored() {
         assert!((number(&object[key][i]) - truth).abs() <= tolerance, "{key} {i}: {object}");
     }
     assert!((number(&object["area"]) - 616.0).abs() < 60.0 && number(&object["angle_degrees"]).abs() <= 90.0, "{object}");
-    // The same model at any number of threads.
+    // The model does not depend on the number of threads.
     done(folder, &["segment", "train", "--images", "train", "--masks", "train", "--model", "n.json", "--threads", "1"]);
     assert_eq!(fs::read(folder.join("m.json")).unwrap(), fs::read(folder.join("n.json")).unwrap());
 }
@@ -111,7 +111,7 @@ fn bad_models_and_arguments_are_refused() {
     for wrong in [["--components", "0"], ["--smoothing", "nan"], ["--space", "cmyk"], ["--open", "5000"]] {
         assert_eq!(run(folder, &[&train[..], &wrong[..]].concat()).code, Some(2), "{wrong:?}");
     }
-    // A prediction overwrites no mask drawn by hand, and no other prediction of the same run.
+    // A prediction overwrites neither a hand-drawn mask nor another prediction of the same run.
     done(folder, &train);
     let drawn = fs::read(folder.join("test/p0_mask.png")).unwrap();
     for images in ["test", "test/p0.png"] {
@@ -122,11 +122,11 @@ fn bad_models_and_arguments_are_refused() {
 }
 
 #[test]
-fn another_shape_of_the_color_is_not_found() {
+fn an_object_of_the_same_color_and_another_shape_is_not_detected() {
     let discs = discs();
     let folder = discs.path();
     done(folder, &["segment", "train", "--images", "train", "--masks", "train", "--model", "m.json"]);
-    // A bar of the disc's color, 48 by 8 pixels, and nothing.
+    // A bar of the disc's color, 48 by 8 pixels, without a disc.
     let scene = |bar: bool| {
         RgbU8::from_fn(96, 64, |x, y| {
             let shade = ((x * 7 + y * 13) % 19) as u8;
@@ -153,7 +153,7 @@ fn another_shape_of_the_color_is_not_found() {
         let least = format!("--min-score={wrong}");
         assert_eq!(run(folder, &[&predict[..], &["--out", "i", &least]].concat()).code, Some(2), "{wrong}");
     }
-    // A model of before there were statistics of objects: no score, everything marked is found.
+    // A model of an older version without object statistics: no score, every object is detected.
     let text = fs::read_to_string(folder.join("m.json")).unwrap();
     let mut model: serde_json::Value = serde_json::from_str(&text).unwrap();
     assert!(model.as_object_mut().unwrap().remove("objects").is_some());

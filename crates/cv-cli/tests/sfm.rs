@@ -1,4 +1,4 @@
-//! `cv sfm` from outside, on walks through rooms that are known.
+//! `cv sfm` as a black box, on rendered walks with known poses.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -20,7 +20,7 @@ fn camera() -> Camera {
     Camera::from_focal(CAMERA[0], CAMERA[1], FOCAL)
 }
 
-/// Photographs from these places, as `NAME00.png` and so on, and their calibration matrix.
+/// Renders photographs from these poses as `NAME00.png` and so on, and writes their calibration matrix.
 fn photographs(folder: &Path, name: &str, scene: &Scene, poses: &[Pose]) -> BTreeMap<String, Pose> {
     fs::create_dir_all(folder).unwrap();
     let mut truth = BTreeMap::new();
@@ -37,8 +37,8 @@ fn photographs(folder: &Path, name: &str, scene: &Scene, poses: &[Pose]) -> BTre
     truth
 }
 
-/// Over all pairs of a model's photographs the largest error of the relative rotation and of the direction between the centers, in degrees, and that of the distance
-/// between the centers after the best scale, as a share of the largest distance.
+/// Returns the largest errors over all pairs of a model's images: of the relative rotation and of the direction between the centers in degrees, and of the distance
+/// between the centers after the best scale, relative to the largest distance.
 fn worst(model: &SparseModel, truth: &BTreeMap<String, Pose>) -> [f64; 3] {
     let images: Vec<_> = model.images.values().collect();
     let (mut turn, mut direction, mut lengths) = (0.0f64, 0.0f64, Vec::new());
@@ -57,8 +57,8 @@ fn worst(model: &SparseModel, truth: &BTreeMap<String, Pose>) -> [f64; 3] {
     [turn.to_degrees(), direction.to_degrees(), off]
 }
 
-/// A pixel is an angle of 1/330, 0.17 degrees; keypoints of rendered photographs are found to a third of one, and each pose rests on a hundred of them or more. A pose
-/// that is wrong is off by degrees. Centers are known to about a thousandth of the longest distance; of neighbors a tenth as far apart that is more than half a degree of direction.
+/// A pixel is an angle of 1/330, 0.17°; keypoints of rendered photographs are localized to a third of that, and each pose depends on a hundred or more. A false pose
+/// is off by degrees. Centers are accurate to about a thousandth of the largest distance; for neighbors at a tenth of it that is more than half a degree of direction.
 fn is_true(model: &SparseModel, truth: &BTreeMap<String, Pose>) {
     let [turn, direction, off] = worst(model, truth);
     println!("{turn:.3} {direction:.3} {off:.4}");
@@ -81,7 +81,7 @@ fn files(folder: &Path) -> Vec<String> {
 }
 
 #[test]
-fn a_walk_around_a_room_is_as_it_was_and_written_whole() {
+fn a_walk_around_a_room_is_reconstructed_and_written_completely() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let truth = photographs(&at("photos"), "walk", &Scene::room(4), &Scene::room_walk(12));
@@ -110,15 +110,15 @@ fn a_walk_around_a_room_is_as_it_was_and_written_whole() {
     assert_eq!(value["observations"].as_u64(), Some(observations as u64));
     let number = |key: &str| value[key].as_f64().unwrap();
     assert!((number("mean_track_length") - observations as f64 / model.points.len() as f64).abs() < 1e-9);
-    // Both of the same errors: no mean is above the root of the mean square. Keypoints are good to a third of a pixel, and no error above four is kept.
+    // The mean of the same errors is at most their RMS. Keypoints are accurate to a third of a pixel, and errors above four are rejected.
     assert!(0.0 < number("mean_reprojection_px") && number("mean_reprojection_px") < number("reprojection_rms_px"));
     assert!(number("reprojection_rms_px") < 1.0 && value["focal_px"][0].as_f64() == Some(FOCAL));
     assert!(value["seconds"]["features"].as_f64().is_some() && value["images"][0]["model"].as_u64() == Some(0));
 
-    // Known cameras are placed all at once, and no two places of the room look alike.
+    // The global solver handles known cameras, and the room has no repeated structure.
     assert!(value["solvers"][0] == "global" && value["refused_pairs"]["repeated"] == 0, "{value}");
 
-    // The pinhole folder: the lens had no distortion, so that its points are where they were, up to the larger focal length of a view without black corners.
+    // The pinhole folder: the lens had no distortion, so the points are unchanged up to the larger focal length of a view without black corners.
     let flat = colmap::read(at("flat/sparse")).unwrap();
     assert_eq!((flat.images.len(), flat.points.len()), (12, model.points.len()));
     for image in flat.images.values() {
@@ -135,7 +135,7 @@ fn a_walk_around_a_room_is_as_it_was_and_written_whole() {
     assert_eq!((frames.len(), frames[3]["file_path"].as_str()), (12, Some("../photos/walk03.png")));
     let image = model.images.values().find(|image| image.name == "walk03.png").unwrap();
     let center = Vector3::from_fn(|i, _| frames[3]["transform_matrix"][i][3].as_f64().unwrap());
-    // The text of the model has a quaternion, that of the transforms a matrix: they agree to rounding.
+    // The model's text has a quaternion, the transforms a matrix: they agree to rounding.
     assert!((image.pose.center().coords - center).norm() < 1e-9);
     let header = String::from_utf8_lossy(&fs::read(at("c.ply")).unwrap()[..200]).into_owned();
     assert!(header.contains(&format!("element vertex {}", model.points.len())), "{header}");
@@ -143,7 +143,7 @@ fn a_walk_around_a_room_is_as_it_was_and_written_whole() {
     assert!(html.contains("data-scene") && html.contains("walk11.png") && html.contains("points in common"));
     assert!(html.trim_end().ends_with("</html>") && !html.contains("not in the model"));
 
-    // The files named one by one in another order, on one thread, with two that are no photographs among them: the same bytes.
+    // The files in another order, on one thread, with two files that are no images: the same bytes.
     fs::write(at("photos/walk05b.png"), b"no photograph").unwrap();
     let mut reversed: Vec<String> = truth.keys().rev().map(|name| format!("photos/{name}")).collect();
     reversed.extend(["photos/walk05b.png".to_owned(), "photos/walk99.png".to_owned()]);
@@ -158,7 +158,7 @@ fn a_walk_around_a_room_is_as_it_was_and_written_whole() {
     let bytes = |name: &str| snapshot(&at(name)).into_iter().map(|(_, bytes)| bytes).collect::<Vec<_>>();
     assert!(bytes("model") == bytes("again"), "another order or number of threads");
 
-    // In the other form, in place of the first.
+    // The binary format replaces the text.
     let ran = cv(folder.path()).args([&call[..], &["--format", "colmap-binary"]].concat()).output().unwrap();
     let said = String::from_utf8(ran.stderr).unwrap();
     assert!(
@@ -167,25 +167,25 @@ fn a_walk_around_a_room_is_as_it_was_and_written_whole() {
     );
     assert_eq!(files(&at("model")), ["cameras.bin", "images.bin", "points3D.bin"]);
     let binary = colmap::read(at("model")).unwrap();
-    // Numbers of text are as exact, but for the half pixel that is added and taken away.
+    // Numbers of the text format are exact, except for the conversion of half a pixel.
     assert!(binary.points == model.points && binary.images.len() == 12);
 }
 
 #[test]
-fn without_a_camera_the_focal_length_is_found() {
+fn an_unknown_focal_length_is_estimated() {
     let folder = tempfile::tempdir().unwrap();
     let truth = photographs(&folder.path().join("photos"), "walk", &Scene::room(4), &Scene::room_walk(12));
     let value = json(folder.path(), &["sfm", "photos", "-o", "model", "--quiet"]);
     assert_eq!(used(&value), [true; 12], "{value}");
     let focal = value["focal_px"][0].as_f64().unwrap();
     let [turn, direction, off] = worst(&colmap::read(folder.path().join("model")).unwrap(), &truth);
-    // The walk comes around: a focal length off by a hundredth would leave a gap of the 360 degrees. Radial distortion, which is estimated with it, takes up some of it.
+    // The walk is closed: a focal length error of 1 % would leave a gap of the 360°. Radial distortion, estimated with it, compensates some of it.
     assert!((focal / FOCAL - 1.0).abs() < 0.01, "{focal}");
     assert!(turn < 0.5 && direction < 1.0 && off < 0.01, "{turn} {direction} {off}");
 }
 
 #[test]
-fn what_makes_no_model_is_refused_with_its_reason() {
+fn photographs_without_a_model_are_refused_with_the_reason() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let (scene, walk) = (Scene::room(4), Scene::room_walk(12));
@@ -200,13 +200,13 @@ fn what_makes_no_model_is_refused_with_its_reason() {
         let ran = run(folder.path(), &["sfm", name, "-o", "model"]);
         assert!(ran.code == Some(2) && ran.stderr.contains("two or more are needed"), "{ran:?}");
     }
-    // The same one twice is one.
+    // A duplicate counts once.
     for copy in ["b.png", "c.png"] {
         fs::copy(at("one/a00.png"), at("one").join(copy)).unwrap();
     }
     let said = call("one");
     assert!(said.contains("1 of 3 photographs") && said.contains("byte for byte, to one/a00.png"), "{said}");
-    // One that can be read.
+    // One readable photograph.
     fs::write(at("one/b.png"), b"").unwrap();
     fs::remove_file(at("one/c.png")).unwrap();
     let said = call("one");
@@ -214,11 +214,11 @@ fn what_makes_no_model_is_refused_with_its_reason() {
         said.contains("1 of 2 photographs") && said.contains("one/b.png: it cannot be read: the file is empty"),
         "{said}"
     );
-    // Two of different places.
+    // Two unrelated photographs.
     photographs(&at("two"), "a", &scene, &walk[..1]);
     photographs(&at("two"), "b", &Scene::street(1, 4, 0), &Scene::street_walk(4, 3)[1..2]);
     assert!(call("two").contains("no two of 2 photographs have enough overlap"));
-    // A camera that only turned.
+    // A pure rotation.
     let first = scene.viewpoint();
     let turned = |i: usize| {
         let turn = cv_core::Rotation3::from_axis_angle(&Vector3::y_axis(), 0.1 * i as f64);
@@ -230,7 +230,7 @@ fn what_makes_no_model_is_refused_with_its_reason() {
 }
 
 #[test]
-fn photographs_of_something_else_are_left_out() {
+fn unrelated_photographs_are_not_registered() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let mut truth = photographs(&at("photos"), "room", &Scene::room(4), &Scene::room_walk(12)[..5]);
@@ -238,7 +238,7 @@ fn photographs_of_something_else_are_left_out() {
         let scene = Scene::street(10 + i, 4, 0);
         truth.extend(photographs(&at("photos"), &format!("street{i}-"), &scene, &Scene::street_walk(4, 3)[1..2]));
     }
-    // One too small to look at.
+    // One too small for features.
     cv_io::write_png(at("photos/tiny.png"), RgbU8::new(3, 3, [9; 3]).view()).unwrap();
     fs::create_dir_all(at("model/1")).unwrap();
     fs::write(at("model/1/cameras.txt"), "").unwrap();
@@ -254,13 +254,13 @@ fn photographs_of_something_else_are_left_out() {
     assert!(reason(&value, "tiny.png").contains("3×3"), "{value}");
     let model = colmap::read(at("model")).unwrap();
     let [turn, direction, off] = worst(&model, &truth);
-    // Five photographs that do not come around leave the focal length less certain, and with it the turns.
+    // In five photographs of an open walk the focal length is less certain, and with it the rotations.
     assert!(turn < 1.0 && direction < 2.0 && off < 0.02, "{turn} {direction} {off}");
 }
 
-/// An EXIF block, little-endian, that tells a position: degrees north and east, meters above the sea.
+/// Returns a little-endian EXIF block with a GPS position: degrees north and east, meters above sea level.
 fn exif_of(north: f64, east: f64, height: f64) -> Vec<u8> {
-    // The only entry of the first directory leads to that of the position, at 26; its values follow it.
+    // The only entry of the first directory points to the GPS directory at 26; its values follow.
     let mut block = b"II*\0\x08\0\0\0\x01\0".to_vec();
     let entry = |block: &mut Vec<u8>, tag: u16, kind: u16, count: u32, value: [u8; 4]| {
         block.extend(tag.to_le_bytes());
@@ -293,12 +293,12 @@ fn exif_of(north: f64, east: f64, height: f64) -> Vec<u8> {
     block
 }
 
-/// The room's place: Y of its world is down; X is east here, Z north.
+/// Converts to the georeferenced frame of the room: Y of its world is down; X is east here, Z north.
 fn east_north_up(p: Point3<f64>) -> Vector3<f64> {
     Vector3::new(p.x, p.z, -p.y)
 }
 
-/// Largest distance of a center of a model from where it was, relative to that of the first photograph.
+/// Returns the largest error of a model's camera centers, relative to that of the first photograph.
 fn off_by(model: &SparseModel, truth: &BTreeMap<String, Pose>) -> f64 {
     let first = east_north_up(truth["walk00.png"].center());
     let off = |image: &cv_core::ModelImage| {
@@ -308,11 +308,11 @@ fn off_by(model: &SparseModel, truth: &BTreeMap<String, Pose>) -> f64 {
 }
 
 #[test]
-fn models_are_brought_to_positions_known_places_and_distances() {
+fn models_are_aligned_to_gps_known_positions_and_distances() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let truth = photographs(&at("photos"), "walk", &Scene::room(4), &Scene::room_walk(12));
-    // Features and pairs once, where the photographs stay the same.
+    // Features and pairs are computed once for the same photographs.
     let call = "sfm photos --camera K.txt --undistorted --features 2000 -o model --keep --resume";
     let call: Vec<&str> = call.split(' ').collect();
     let with = |more: &[&str]| {
@@ -320,7 +320,7 @@ fn models_are_brought_to_positions_known_places_and_distances() {
         assert_eq!(used(&value), [true; 12], "{value}");
         (value, colmap::read(at("model")).unwrap())
     };
-    // Nothing known: upright. The walk looks down a little, by as much to all sides.
+    // Without positions: the vertical is estimated. The walk looks down a little, equally in all directions.
     let (value, model) = with(&[]);
     assert_eq!(
         (value["alignment"]["by"].as_str(), value["alignment"]["unit"].as_str()),
@@ -336,7 +336,7 @@ fn models_are_brought_to_positions_known_places_and_distances() {
     // The walk is an ellipse: more of its photographs look along the room.
     assert!(up(&model) < 0.03, "{}", up(&model));
 
-    // A tape between two photographs.
+    // A measured distance between two photographs.
     let apart = |a: &str, b: &str| (truth[a].center() - truth[b].center()).norm();
     let tape = format!("{:.4}", apart("walk02.png", "walk08.png"));
     let (value, model) = with(&["--distance", "walk02.png", "photos/walk08.png", &tape, "--covariance", "sigma.json"]);
@@ -346,7 +346,8 @@ fn models_are_brought_to_positions_known_places_and_distances() {
         (images.len(), sigma["points"].as_array().unwrap().len(), sigma["unit"].as_str()),
         (12, model.points.len(), Some("m"))
     );
-    // A third of a pixel at 330 is a thousandth; a camera sees a hundred points and more from some meters: some tenths of a millimeter to some millimeters, and of one camera nothing.
+    // A third of a pixel at 330 px is an angle of 0.001; a camera observes a hundred or more points at some meters: standard deviations
+    // from tenths of a millimeter to some millimeters, and zero for the first camera.
     let deviation = |image: &Value| (0..3).map(|i| image["center"][i].as_f64().unwrap()).fold(0.0, f64::max);
     assert!(
         images.iter().all(|i| deviation(i) < 0.01) && images.iter().filter(|i| deviation(i) > 1e-4).count() >= 10,
@@ -355,11 +356,11 @@ fn models_are_brought_to_positions_known_places_and_distances() {
     assert!(images.iter().any(|i| deviation(i) < 1e-12 && i["name"] == sigma["exact"]["pose_of"]));
     assert_eq!((value["alignment"]["by"].as_str(), value["alignment"]["unit"].as_str()), (Some("distance"), Some("m")));
     let center = |name: &str| model.images.values().find(|image| image.name == name).unwrap().pose.center();
-    // Centers are known to a thousandth of the room.
+    // Centers are accurate to a thousandth of the room.
     let found = (center("walk01.png") - center("walk06.png")).norm();
     assert!((found / apart("walk01.png", "walk06.png") - 1.0).abs() < 0.005 && up(&model) < 0.03, "{found}");
 
-    // A list of places, one of them wrong, one of no photograph.
+    // A list of positions, with an outlier and an unknown photograph.
     let first = east_north_up(truth["walk00.png"].center());
     let mut list = "photo,x,y,z\n".to_owned();
     for (i, (name, pose)) in truth.iter().enumerate() {
@@ -370,13 +371,13 @@ fn models_are_brought_to_positions_known_places_and_distances() {
     fs::write(at("places.csv"), format!("{list}other.png,0,0,0\n")).unwrap();
     let ran = run(folder.path(), &[&call[..], &["--known", "places.csv", "--report", "page"]].concat());
     assert!(ran.stderr.contains("walk04.png by 1.4 m") && ran.stderr.contains("such as “other.png”"), "{}", ran.stderr);
-    // Centers are known to a thousandth of the room, which is three meters.
+    // Centers are accurate to a thousandth of the room, which is three meters.
     let off = off_by(&colmap::read(at("model")).unwrap(), &truth);
     assert!(off < 0.02, "{off}");
     let html = fs::read_to_string(at("page/report.html")).unwrap();
     assert!(html.contains("in the frame of places.csv, in meters, by 11 photographs"), "{}", ran.stderr);
 
-    // Positions in the files: the lengths of a degree at 47.255° are by the radii of WGS 84, M = 6,361,920 m and N = 6,389,700 m.
+    // Positions in the files: the lengths of a degree at 47.255° follow from the radii of WGS 84, M = 6,361,920 m and N = 6,389,700 m.
     let (lat, lon) = (47.255f64, 8.51f64);
     let (along, across) = (6_361_920.0f64.to_radians(), 6_389_700.0f64.to_radians() * lat.to_radians().cos());
     for (i, (name, pose)) in truth.iter().enumerate() {
@@ -397,7 +398,7 @@ fn models_are_brought_to_positions_known_places_and_distances() {
     assert!((alignment["origin"]["latitude"].as_f64().unwrap() - lat).abs() < 1e-4, "{alignment}");
     let off = off_by(&model, &truth);
     assert!(off < 0.02, "{off}");
-    // The tape tells another scale than the positions, and is taken; without them there is nothing to disagree with.
+    // The measured distance contradicts the scale of the positions and takes precedence; without positions there is no contradiction.
     let wrong = ["--distance", "walk02.png", "walk08.png", "7.5"];
     let ran = run(folder.path(), &[&call[..], &wrong].concat());
     assert!(
@@ -410,7 +411,7 @@ fn models_are_brought_to_positions_known_places_and_distances() {
 }
 
 #[test]
-fn places_that_mean_nothing_are_refused_before_the_work() {
+fn invalid_positions_are_refused_before_the_computation() {
     let folder = tempfile::tempdir().unwrap();
     for name in ["a.png", "b.png", "c.png"] {
         fs::write(folder.path().join(name), name).unwrap();
@@ -430,7 +431,7 @@ fn places_that_mean_nothing_are_refused_before_the_work() {
 }
 
 #[test]
-fn a_run_that_is_killed_goes_on_to_the_same_bytes() {
+fn a_resumed_run_gives_the_same_bytes() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     photographs(&at("photos"), "walk", &Scene::room(4), &Scene::room_walk(12)[..7]);
@@ -470,14 +471,14 @@ fn a_run_that_is_killed_goes_on_to_the_same_bytes() {
         fs::remove_dir_all(at("model")).unwrap();
     }
 
-    // Everything kept: features and pairs are taken.
+    // With all files kept, features and pairs are reused.
     let keep = [&call("model")[..], &["--keep"]].concat();
     json(folder.path(), &keep);
     assert_eq!(kept().len(), 8);
     let again = [&keep[..], &["--resume"]].concat();
     let value = json(folder.path(), &again);
     assert_eq!((value["resumed"]["features"].as_u64(), value["resumed"]["pairs"].as_bool()), (Some(7), Some(true)));
-    // What is damaged, cut short, or another photograph's is made anew, and said to be.
+    // Damaged, truncated and foreign files are computed again, with a message.
     let names: Vec<String> = kept().into_iter().filter(|name| name.ends_with(".features")).collect();
     let path = |i: usize| at("model/.cv-sfm").join(&names[i]);
     let mut bytes = fs::read(path(0)).unwrap();
@@ -490,14 +491,14 @@ fn a_run_that_is_killed_goes_on_to_the_same_bytes() {
     assert_eq!(ran.stderr.matches("it is recomputed").count(), 4, "{}", ran.stderr);
     let models = ["cameras.txt", "images.txt", "points3D.txt"].map(|file| fs::read(at("model").join(file)).unwrap());
     assert!(models[..] == truth[..]);
-    // Of other options nothing is taken; of other photographs what is the same.
+    // Other options reuse nothing; other photographs reuse the common ones.
     let fewer: Vec<&str> = again.iter().map(|word| if *word == "3000" { "2500" } else { word }).collect();
     let value = json(folder.path(), &fewer);
     assert_eq!((value["resumed"]["features"].as_u64(), value["resumed"]["pairs"].as_bool()), (Some(0), Some(false)));
     fs::remove_file(at("photos/walk06.png")).unwrap();
     let value = json(folder.path(), &again);
     assert_eq!((value["resumed"]["features"].as_u64(), value["resumed"]["pairs"].as_bool()), (Some(6), Some(false)));
-    // Without the wish it is told of, left alone, and gone in the end.
+    // Without --resume the state is reported, left alone, and removed at the end.
     let ran = run(folder.path(), &call("model"));
     assert!(ran.stderr.contains("--resume continues it") && !at("model/.cv-sfm").exists(), "{}", ran.stderr);
 }
@@ -514,7 +515,7 @@ fn photographs_are_added_to_a_model() {
         &[&call[..], &["--camera", "K.txt", "--undistorted", "--distance", "walk00.png", "walk04.png", "3.0"]].concat(),
     );
     let first = colmap::read(at("model")).unwrap();
-    // In a frame of somebody else's.
+    // In an arbitrary frame.
     let mut moved = first.clone();
     let to = Pose::new(cv_core::Rotation3::from_euler_angles(0.3, 1.0, -0.4), Vector3::new(5.0, 6.0, 7.0));
     for image in moved.images.values_mut() {
@@ -530,7 +531,7 @@ fn photographs_are_added_to_a_model() {
     assert_eq!((value["alignment"]["by"].as_str(), value["alignment"]["agree"].as_u64()), (Some("model"), Some(8)));
     let more = colmap::read(at("model")).unwrap();
     is_true(&more, &truth);
-    // The lens is the same to the last digit that the text has, and the frame to what eight poses change by with new photographs: each of the two
+    // The lens is the same to the last digit of the text, and the frame changes by no more than eight poses do with new photographs: each of the two
     // models is within a hundredth of a meter of the truth.
     assert_eq!(more.cameras.values().map(|c| c.fx).collect::<Vec<_>>(), [FOCAL]);
     for image in moved.images.values() {
@@ -550,7 +551,7 @@ fn photographs_are_added_to_a_model() {
     assert!(!at("new").exists());
 }
 
-/// Of a binary PLY with colors.
+/// Reads the positions of a binary PLY with colors.
 fn positions_and_normals(bytes: &[u8]) -> Vec<[[f32; 3]; 2]> {
     let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
     let header = String::from_utf8_lossy(&bytes[..end]).into_owned();
@@ -562,7 +563,7 @@ fn positions_and_normals(bytes: &[u8]) -> Vec<[[f32; 3]; 2]> {
 }
 
 #[test]
-fn a_dense_cloud_lies_on_the_surfaces() {
+fn points_of_a_dense_cloud_are_on_the_surfaces() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
     let (scene, walk) = (Scene::room(4), Scene::room_walk(48));
@@ -580,7 +581,7 @@ fn a_dense_cloud_lies_on_the_surfaces() {
     let cloud = positions_and_normals(&fs::read(at("dense.ply")).unwrap());
     assert_eq!(value["dense_points"].as_u64(), Some(cloud.len() as u64));
     assert!(value["dense_pairs"].as_u64().unwrap() >= 6, "{value}");
-    // Of 460,000 pixels, of each of which there may be a point.
+    // Of at most one point for each of 460,000 pixels.
     assert!(cloud.len() > 40_000, "{}", cloud.len());
     let depths: Vec<_> = walk[..6]
         .iter()
@@ -602,13 +603,14 @@ fn a_dense_cloud_lies_on_the_surfaces() {
         facing += usize::from(depths.iter().any(|(pose, _)| normal.dot(&(pose.center() - world)) > 0.0));
     }
     let share = right as f64 / cloud.len() as f64;
-    // Neighbors are 0.15 to 0.2 m apart: things 5 m away have a disparity of eight pixels, of which four tenths of one are five per cent. Pixels at edges show a share of what is behind, in both.
+    // The baseline of neighbors is 0.15 to 0.2 m: objects at 5 m have a disparity of eight pixels, of which 0.4 px are 5 %. Pixels at
+    // depth discontinuities blend foreground and background in both views.
     assert!(share > 0.95 && facing == cloud.len(), "{share}");
     let other = [&call[..], &["--dense", "again.ply", "--dense-size", "320", "--threads", "1"]].concat();
     json(folder.path(), &other);
     assert!(fs::read(at("dense.ply")).unwrap() == fs::read(at("again.ply")).unwrap(), "another number of threads");
 
-    // One pair, which nothing confirms: what is wrong, and the model is there all the same.
+    // A single pair has no confirmation: the error is reported, and the model is still written.
     let two = ["sfm", "photos/walk00.png", "photos/walk03.png", "--camera", "K.txt", "--undistorted", "-o", "two"];
     let ran = refused(folder.path(), &[&two[..], &["--dense", "two.ply"]].concat());
     assert!(ran.stderr.contains("is confirmed by another pair; try: three or more photographs"), "{}", ran.stderr);

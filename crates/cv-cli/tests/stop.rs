@@ -1,4 +1,4 @@
-//! Ctrl-C, seen from outside: how soon the program ends, how it says so, and what it leaves behind.
+//! Ctrl-C as a black box: the time until the program ends, its message, and the remaining files.
 
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
@@ -15,10 +15,10 @@ use std::{
 };
 use support::{cv, snapshot};
 
-/// The bar is 200 ms on a machine that is not busy; tests run beside others, ten to a core where several suites do.
+/// The target is 200 ms on an idle machine; tests run beside others, up to ten per core.
 const SOON: Duration = Duration::from_secs(2);
 
-/// Texture that is alike nowhere.
+/// Texture without repetition.
 fn texture(x: usize, y: usize) -> u8 {
     let cell = |size: usize| {
         let mut v =
@@ -29,7 +29,7 @@ fn texture(x: usize, y: usize) -> u8 {
     [3, 7, 17].map(|size| cell(size) / 3).iter().sum()
 }
 
-/// Two pictures of a textured wall, `shift` pixels apart, and a mask.
+/// Two images of a textured wall, shifted by `shift` pixels, and a mask.
 fn write_inputs(folder: &Path, (width, height): (usize, usize), shift: usize) {
     for (name, shift) in [("left.ppm", 0), ("right.ppm", shift)] {
         let image = RgbU8::from_fn(width, height, |x, y| [texture(x + shift, y), texture(y, x + shift), 90]);
@@ -47,13 +47,13 @@ const RIG: &str = "schema: cv-rig/1\nunit: m\n\
     right: {width: 2400, height: 1800, fx: 2400, fy: 2400, cx: 1199.5, cy: 899.5}\n\
     rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\ntranslation: [-0.12, 0, 0]\n";
 
-/// Starts the program and waits until it listens to signals.
+/// Starts the program and waits until it handles signals.
 fn start(folder: &Path, args: &[&str]) -> Child {
     let mut command = cv(folder);
     command.args(args).args(["--threads", "1"]).stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut child = command.spawn().unwrap();
     let status = format!("/proc/{}/status", child.id());
-    // SIGINT is signal 2: the second bit of the signals that are caught.
+    // SIGINT is signal 2: the second bit of the mask of caught signals.
     let listens = |status: &str| {
         let caught = status.lines().find_map(|line| line.strip_prefix("SigCgt:"));
         caught.is_some_and(|mask| u64::from_str_radix(mask.trim(), 16).unwrap() & 2 != 0)
@@ -70,7 +70,7 @@ fn signal(child: &Child, name: &str) {
     assert!(sent.success());
 }
 
-/// Waits for the end that follows a signal.
+/// Waits for the end after a signal.
 fn stopped(child: Child, what: &str) {
     let since = Instant::now();
     was_stopped(child.wait_with_output().unwrap(), since.elapsed(), what);
@@ -86,7 +86,7 @@ fn was_stopped(Output { status, stdout, stderr }: Output, took: Duration, what: 
 }
 
 #[test]
-fn a_stopped_command_leaves_everything_as_it_was() {
+fn a_stopped_command_leaves_all_files_unchanged() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     write_inputs(folder, (2400, 1800), 30);
@@ -94,7 +94,7 @@ fn a_stopped_command_leaves_everything_as_it_was() {
     for name in ["d.pfm", "c.png", "m.txt", "model.json"] {
         fs::write(folder.join(name), "old").unwrap();
     }
-    // With moments in milliseconds at which each is still at work on a fast machine: they take a second and more, training a third of it.
+    // With times in milliseconds at which each still runs on a fast machine: they take a second or more, training a third of it.
     let commands: [(&[&str], [u64; 3]); 4] = [
         (&["depth", "left.ppm", "right.ppm", "-o", "d.pfm", "--confidence", "c.png"], [0, 150, 400]),
         (&["match", "left.ppm", "right.ppm", "-o", "m.txt", "--save-features", "features"], [0, 150, 400]),
@@ -114,7 +114,7 @@ fn a_stopped_command_leaves_everything_as_it_was() {
     }
 }
 
-/// Names of all there is in a folder.
+/// Returns the names of all entries of a folder.
 fn names(folder: &Path) -> Vec<String> {
     let mut names: Vec<String> =
         fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
@@ -123,7 +123,7 @@ fn names(folder: &Path) -> Vec<String> {
 }
 
 #[test]
-fn what_is_being_written_is_removed() {
+fn an_output_in_progress_is_removed() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     write_inputs(folder, (2400, 1800), 30);
@@ -131,13 +131,13 @@ fn what_is_being_written_is_removed() {
     let out = folder.join("rectified");
     let args = ["rectify", "left.ppm", "right.ppm", "--rig", "rig.yaml", "--out", "rectified"];
     for twice in [false, true] {
-        // On a busy machine the signal may come when all is written, and be heard before the program ends: then once more.
+        // On a busy machine the signal may arrive after all is written, before the program ends: then it is repeated.
         let caught = (0..20).find_map(|_| {
             fs::remove_dir_all(&out).ok();
             fs::create_dir(&out).unwrap();
             fs::write(out.join("left.png"), "old").unwrap();
             let mut child = start(folder, &args);
-            // Pictures of four megapixels are being encoded: no callback is asked meanwhile.
+            // While images of four megapixels are encoded, no callback runs.
             while names(&out).len() < 2 && child.try_wait().unwrap().is_none() {
                 sleep(Duration::from_millis(1));
             }
@@ -157,7 +157,7 @@ fn what_is_being_written_is_removed() {
 }
 
 #[test]
-fn frames_that_are_done_stay_and_are_whole() {
+fn completed_frames_are_kept() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     write_inputs(folder, (640, 480), 20);
@@ -183,7 +183,7 @@ fn frames_that_are_done_stay_and_are_whole() {
 }
 
 #[test]
-fn the_demo_stops_within_its_jobs() {
+fn the_demo_stops_within_a_job() {
     let folder = tempfile::tempdir().unwrap();
     for wait in [50, 700] {
         let child = start(folder.path(), &["demo"]);
@@ -196,9 +196,9 @@ fn the_demo_stops_within_its_jobs() {
     }
 }
 
-/// A pipe into which nobody writes keeps a command where no callback is asked; the program ends all the same.
+/// A pipe without a writer blocks a command outside all callbacks; the program still ends.
 #[test]
-fn a_command_that_waits_for_its_input_stops_too() {
+fn a_command_that_waits_for_input_stops() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     write_inputs(folder, (64, 48), 3);

@@ -73,7 +73,7 @@ fn check(solve: impl Fn(&ImagePoints, &Pose) -> Vec<f64>) -> usize {
 }
 
 #[test]
-fn five_points() {
+fn the_five_point_solver_handles_regular_configurations() {
     let solved = check(|[a, b], pose| {
         let mut errors = Vec::new();
         essential_five_point(&first(a), &first(b), |e| errors.push(error(&e, pose)));
@@ -84,7 +84,7 @@ fn five_points() {
 }
 
 #[test]
-fn seven_points() {
+fn the_seven_point_solver_handles_regular_configurations() {
     let solved = check(|[a, b], pose| {
         let row = |i: usize, j: usize| a[i].to_homogeneous()[j % 3] * b[i].to_homogeneous()[j / 3];
         // Padded to nine rows, for nine right singular vectors.
@@ -108,7 +108,7 @@ fn seven_points() {
 }
 
 #[test]
-fn six_points() {
+fn the_six_point_solver_handles_regular_configurations() {
     let solved = check(|[a, b], pose| {
         // Degenerate motions: optical axes that are parallel or intersect at equal distances.
         let axis = pose.rotation.inverse() * Vector3::z();

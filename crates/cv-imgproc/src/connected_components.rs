@@ -269,8 +269,8 @@ mod tests {
 
     #[test]
     fn enclosed_holes_are_filled_and_open_bays_are_not() {
-        let picture = ["#####.", "#..#..", "#.##..", "#####.", "....#.", "##..##"];
-        let mask = Mask::from_fn(6, 6, |x, y| [picture[y].as_bytes()[x] == b'#']);
+        let rows = ["#####.", "#..#..", "#.##..", "#####.", "....#.", "##..##"];
+        let mask = Mask::from_fn(6, 6, |x, y| [rows[y].as_bytes()[x] == b'#']);
         let filled = fill_holes(mask.view(), Connectivity::Eight, usize::MAX);
         for y in 0..6 {
             for x in 0..6 {

@@ -5,9 +5,9 @@ use cv_io::{pfm, read_map, read_rgb, write_png};
 pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     let folder = std::env::temp_dir().join("cv-io-example");
     std::fs::create_dir_all(&folder)?;
-    let picture = RgbU8::from_fn(64, 48, |x, y| [4 * x as u8, 5 * y as u8, 128]);
-    write_png(folder.join("picture.png"), picture.view())?;
-    assert_eq!(read_rgb(folder.join("picture.png"))?, picture);
+    let image = RgbU8::from_fn(64, 48, |x, y| [4 * x as u8, 5 * y as u8, 128]);
+    write_png(folder.join("image.png"), image.view())?;
+    assert_eq!(read_rgb(folder.join("image.png"))?, image);
     // Invalid disparity is NaN in memory, and the format's own marker in the file.
     let disparity = GrayF32::from_fn(64, 48, |x, _| [if x < 8 { f32::NAN } else { x as f32 }]);
     pfm::write(folder.join("disparity.pfm"), disparity.view())?;

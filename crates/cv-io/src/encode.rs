@@ -48,7 +48,7 @@ png_pixels!(u16, 4, Rgba, Sixteen, |out, row| out.extend(row.iter().flat_map(|v|
 /// Encodes a PNG file.
 ///
 /// # Errors
-/// [`FormatError::NotRepresentable`] for an empty picture or one whose sides exceed 2³¹ − 1.
+/// [`FormatError::NotRepresentable`] for an empty image or one whose sides exceed 2³¹ − 1.
 pub fn encode_png(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
     encode_png_parts(view.parts(), &Metadata::default(), None)
 }
@@ -61,7 +61,7 @@ fn encode_png_parts(
 ) -> Result<Vec<u8>, FormatError> {
     let side = |n: usize| u32::try_from(n).ok().filter(|&n| n > 0 && n <= i32::MAX as u32);
     let (Some(w), Some(h)) = (side(width), side(height)) else {
-        return Err(FormatError::NotRepresentable { format: "PNG", what: format!("a picture of {width}×{height}") });
+        return Err(FormatError::NotRepresentable { format: "PNG", what: format!("an image of {width}×{height}") });
     };
     let mut bytes = Vec::new();
     let mut info = png::Info::with_size(w, h);
@@ -118,7 +118,7 @@ impl JpegPixels for ImageView<'_, u8, 3> {}
 /// Encodes a JPEG file at `quality` 1 to 100 (95 is visually lossless). Chroma is not subsampled from 90 on.
 ///
 /// # Errors
-/// [`FormatError::NotRepresentable`] for an empty picture or one with a side above 65535.
+/// [`FormatError::NotRepresentable`] for an empty image or one with a side above 65535.
 pub fn encode_jpeg(view: impl JpegPixels, quality: u8) -> Result<Vec<u8>, FormatError> {
     encode_jpeg_parts(view.parts(), quality, &Metadata::default())
 }
@@ -130,7 +130,7 @@ fn encode_jpeg_parts(
 ) -> Result<Vec<u8>, FormatError> {
     let side = |n: usize| u16::try_from(n).ok().filter(|&n| n > 0);
     let (Some(w), Some(h)) = (side(width), side(height)) else {
-        return Err(FormatError::NotRepresentable { format: "JPEG", what: format!("a picture of {width}×{height}") });
+        return Err(FormatError::NotRepresentable { format: "JPEG", what: format!("an image of {width}×{height}") });
     };
     let channels = color.samples();
     let mut bytes = Vec::new();
@@ -202,7 +202,7 @@ pub fn write_jpeg(path: impl AsRef<Path>, view: impl JpegPixels) -> Result<(), I
 /// Encodes a TIFF file with Deflate compression.
 ///
 /// # Errors
-/// [`FormatError::NotRepresentable`] for an empty picture or one of more than 4 GB.
+/// [`FormatError::NotRepresentable`] for an empty image or one of more than 4 GB.
 pub fn encode_tiff(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
     encode_tiff_parts(view.parts(), &Metadata::default())
 }

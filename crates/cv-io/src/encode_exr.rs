@@ -14,14 +14,13 @@ const COMPRESSION_LEVEL: u8 = 3;
 /// Encodes an OpenEXR file of linear RGB in 32-bit floats, 1 for display white. O(pixels).
 ///
 /// # Errors
-/// [`FormatError::NotRepresentable`] for an empty picture or one whose sides exceed 2³¹ − 1.
+/// [`FormatError::NotRepresentable`] for an empty image or one whose sides exceed 2³¹ − 1.
 pub fn encode_exr(view: ImageView<'_, f32, 3>) -> Result<Vec<u8>, FormatError> {
     let (width, height) = view.size();
     let last = |n: usize| i32::try_from(n).ok().filter(|&n| n > 0).map(|n| n - 1);
     let (Some(right), Some(bottom)) = (last(width), last(height)) else {
         return Err(FormatError::NotRepresentable {
-            format: "OpenEXR",
-            what: format!("a picture of {width}×{height}"),
+            format: "OpenEXR", what: format!("an image of {width}×{height}")
         });
     };
     let mut bytes = vec![0x76, 0x2f, 0x31, 0x01, 2, 0, 0, 0];

@@ -30,7 +30,7 @@ pub(crate) fn encode_samples(samples: &Samples<'_>, metadata: &Metadata) -> Resu
     let Samples { width, height, channels, depth, bytes } = *samples;
     let side = |n: usize| u32::try_from(n).ok().filter(|&n| n > 0);
     let (Some(w), Some(h)) = (side(width), side(height)) else {
-        return Err(FormatError::NotRepresentable { format: "TIFF", what: format!("a picture of {width}×{height}") });
+        return Err(FormatError::NotRepresentable { format: "TIFF", what: format!("an image of {width}×{height}") });
     };
     let row = width * channels * depth;
     let rows = (STRIP_BYTES / row).clamp(1, height);

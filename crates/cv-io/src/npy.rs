@@ -316,7 +316,7 @@ fn parse_header(text: &str) -> Option<Header> {
 /// Encodes an array, version 1.0, little-endian, C order.
 ///
 /// # Errors
-/// [`FormatError::NotRepresentable`] where the values are not as many as the shape says.
+/// [`FormatError::NotRepresentable`] if the number of values is not that of the shape.
 pub fn encode(array: &NpyArray) -> Result<Vec<u8>, FormatError> {
     let count = array.shape.iter().try_fold(1usize, |n, &s| n.checked_mul(s));
     if count != Some(array.len()) || array.shape.len() > 32 {

@@ -5,7 +5,7 @@ use cv_panorama::{AlignOptions, Photo, VerifyOptions, View, align, verify_pair};
 use nalgebra::Rotation3;
 
 pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
-    // A camera of 900 px focal length that turned by 25 degrees to the right.
+    // A camera with a focal length of 900 px, rotated by 25 degrees to the right.
     let camera = Camera::from_focal(1200, 800, 900.0);
     let turn = Rotation3::from_axis_angle(&Vector3::y_axis(), -25_f64.to_radians());
     let [a, b] = [Rotation3::identity(), turn].map(|r| View { camera, from_world: r.into_inner() });

@@ -1,10 +1,10 @@
-//! Two overlapping pictures, matches between them, one panorama.
+//! Stitches two overlapping images from given matches.
 
 use cv_core::{Correspondence, RgbU8, Silent};
 use cv_panorama::{AlignOptions, CameraMotion, CompositingOptions, Photo, VerifyOptions, align, render, verify_pair};
 
 pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
-    // Two windows, 200 pixels apart, of one picture; a matcher would find such points.
+    // Two crops of one image, 200 pixels apart; a matcher would return such matches.
     let scene = |x: usize, y: usize| [(x / 2 % 256) as u8, (y * 3 % 256) as u8, (x * y / 40 % 256) as u8];
     let left = RgbU8::from_fn(400, 300, scene);
     let right = RgbU8::from_fn(400, 300, |x, y| scene(x + 200, y));
@@ -12,7 +12,7 @@ pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
     let matches: Vec<_> = points.map(|(x, y)| Correspondence::new(x, y, x - 200.0, y)).collect();
 
     let pair = verify_pair((0, left.size()), (1, right.size()), &matches, &VerifyOptions::default())?;
-    // The camera slid along a flat picture; `CameraMotion::Auto` finds that out for photographs.
+    // The camera is translated along a plane; `CameraMotion::Auto` detects this for photographs.
     let options = AlignOptions { motion: CameraMotion::Homography, ..AlignOptions::default() };
     let alignment = align(&[Photo::new(400, 300); 2], &[pair], &options, &Silent)?;
     let panorama = render(&[left.view(), right.view()], &alignment, &CompositingOptions::default(), &Silent)?;

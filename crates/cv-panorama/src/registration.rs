@@ -54,7 +54,7 @@ pub enum RegistrationError {
     Count {
         /// Photographs registered.
         registered: usize,
-        /// Photographs given.
+        /// Number of photographs given.
         got: usize,
     },
     /// The size of a photograph differs.
@@ -459,7 +459,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_what_is_read() {
+    fn registrations_round_trip() {
         let made = registration();
         let back = Registration::try_from(RegistrationFile::from(made.clone())).unwrap();
         assert_eq!(back, made);
@@ -476,7 +476,7 @@ mod tests {
     }
 
     #[test]
-    fn other_photographs_are_refused_with_both_numbers() {
+    fn a_registration_of_other_photographs_is_refused_with_the_numbers() {
         let made = registration();
         assert_eq!(made.check_photographs(&SIZES), Ok(()));
         let error = made.check_photographs(&SIZES[..2]).unwrap_err();
@@ -486,7 +486,7 @@ mod tests {
     }
 
     #[test]
-    fn files_that_are_damaged_are_refused() {
+    fn damaged_files_are_refused() {
         let refused = |damage: &dyn Fn(&mut RegistrationFile)| {
             let mut file = RegistrationFile::from(registration());
             damage(&mut file);

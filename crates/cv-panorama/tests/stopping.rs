@@ -1,4 +1,4 @@
-//! A panorama stops within 200 ms of being told to, in its longest stages too.
+//! A panorama stops within 200 ms of a cancellation request, in its longest stages too.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
 
@@ -9,14 +9,14 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
-/// Remembers when it was asked, and in which stage; stops at a given number of questions.
+/// Records the time and stage of each poll; cancels at a given number of polls.
 struct Asked {
     stop_at: usize,
     count: AtomicUsize,
     times: Mutex<Vec<(&'static str, Duration)>>,
 }
 
-/// Time that this thread worked, so that what else the machine does is left out; time that passed, where the system does not tell.
+/// Processor time of this thread, to exclude other load; wall time if the system does not report it.
 fn worked() -> Duration {
     static START: OnceLock<Instant> = OnceLock::new();
     // Linux: the first number is the nanoseconds on a processor.
@@ -45,8 +45,8 @@ impl Progress for Asked {
     }
 }
 
-/// Photographs `width` wide, each 30 degrees to the right of the last and 50 degrees across, all showing the same texture: what does not fit at the seams
-/// makes the cuts hard.
+/// Photographs of a given width with a field of view of 50°, spaced by 30°, all with the same texture: the mismatch at the seams makes the graph
+/// cuts slow.
 struct Set {
     photo: RgbU8,
     count: usize,
@@ -90,12 +90,12 @@ impl Set {
     }
 }
 
-/// The bound on a machine that is not busy. Rows between two questions do not grow with the photographs; what does (the preview's averages, a photograph
-/// turned gray) is some ten nanoseconds a pixel.
+/// The limit on an idle machine. Rows between two polls do not grow with the photographs; stages that do (the preview's averages, gray
+/// conversion) take some ten nanoseconds per pixel.
 const BOUND: Duration = Duration::from_millis(200);
 
 #[test]
-fn no_stage_goes_on_for_long_without_asking() {
+fn every_stage_checks_for_cancellation_regularly() {
     let set = Set::new(8, 1000);
     for &(_, blend) in BlendMode::NAMES {
         let (stage, gap) = set.longest_gap(blend);
@@ -106,7 +106,7 @@ fn no_stage_goes_on_for_long_without_asking() {
 
 #[test]
 #[ignore = "8 photographs of 12 megapixels: a minute and 4 GB"]
-fn no_stage_of_large_photographs_goes_on_for_long_without_asking() {
+fn every_stage_of_large_photographs_checks_for_cancellation_regularly() {
     let set = Set::new(8, 4000);
     for &(_, blend) in BlendMode::NAMES {
         let (stage, gap) = set.longest_gap(blend);
@@ -116,7 +116,7 @@ fn no_stage_of_large_photographs_goes_on_for_long_without_asking() {
 }
 
 #[test]
-fn once_told_to_stop_no_thread_goes_on() {
+fn every_thread_stops_after_cancellation() {
     let set = Set::new(4, 500);
     let whole = Asked::new(usize::MAX);
     set.render(BlendMode::Multiband, &whole).unwrap();

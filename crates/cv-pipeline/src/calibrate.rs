@@ -214,14 +214,14 @@ pub fn calibrate(
     };
     // Corners are renumbered by the symmetry of the board that the calibration found.
     for (corners, view) in observations.views.iter_mut().zip(&calibration.views) {
-        for (corners, picture) in corners.iter_mut().zip(&view.images) {
-            corners.iter_mut().for_each(|c| c.point = observations.target.symmetric_index(c.point, picture.symmetry));
+        for (corners, image) in corners.iter_mut().zip(&view.images) {
+            corners.iter_mut().for_each(|c| c.point = observations.target.symmetric_index(c.point, image.symmetry));
         }
     }
     for (refusals, view) in refusals.iter_mut().zip(&calibration.views) {
-        for (refusal, picture) in refusals.iter_mut().zip(&view.images) {
-            if refusal.is_none() && !picture.outcome.is_used() {
-                *refusal = Some(PhotoRefusal::Corners(picture.outcome));
+        for (refusal, image) in refusals.iter_mut().zip(&view.images) {
+            if refusal.is_none() && !image.outcome.is_used() {
+                *refusal = Some(PhotoRefusal::Corners(image.outcome));
             }
         }
     }

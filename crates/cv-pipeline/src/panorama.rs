@@ -189,7 +189,7 @@ impl<T> PanoramaResult<T> {
         correspondences(&self.features[pair.a], &self.features[pair.b], &pair.matches)
     }
 
-    /// Returns the registration for other photographs of the same cameras; `names` are those of the photographs, as many as are known.
+    /// Returns the registration for other photographs of the same cameras; `names` are those of the photographs, possibly fewer.
     ///
     /// # Errors
     /// [`RegistrationError`] where a parameter is out of range.

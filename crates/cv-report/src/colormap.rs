@@ -212,11 +212,11 @@ impl ColorScale {
 /// Draws a colored map with a color bar on its right.
 pub fn draw_map(map: ImageView<'_, f32, 1>, style: &MapStyle) -> RgbU8 {
     let range = style.value_range(map);
-    let picture = colorize(map, range, style.colormap);
-    let bar = color_bar(picture.height().max(160), range, style.colormap, &style.label);
-    let mut raster = Raster::new(picture.width() + bar.width(), picture.height().max(bar.height()), colors::WHITE);
-    raster.paste(picture.view(), 0, 0);
-    raster.paste(bar.view(), picture.width() as i64, 0);
+    let colored = colorize(map, range, style.colormap);
+    let bar = color_bar(colored.height().max(160), range, style.colormap, &style.label);
+    let mut raster = Raster::new(colored.width() + bar.width(), colored.height().max(bar.height()), colors::WHITE);
+    raster.paste(colored.view(), 0, 0);
+    raster.paste(bar.view(), colored.width() as i64, 0);
     raster.into_image()
 }
 
@@ -235,12 +235,12 @@ mod tests {
     #[test]
     fn near_is_blue_and_far_is_red() {
         let depth = GrayF32::from_vec(4, 1, vec![1.0, 9.0, f32::NAN, f32::INFINITY]).unwrap();
-        let picture = colorize(depth.view(), (1.0, 9.0), Colormap::Turbo);
-        let ([r, _, b], [far_r, _, far_b]) = (picture.at(0, 0), picture.at(1, 0));
-        assert!(b > r && far_r > far_b, "{:?} {:?}", picture.at(0, 0), picture.at(1, 0));
-        assert_eq!((picture.at(2, 0), picture.at(3, 0)), (colors::UNKNOWN, colors::UNKNOWN));
+        let drawn = colorize(depth.view(), (1.0, 9.0), Colormap::Turbo);
+        let ([r, _, b], [far_r, _, far_b]) = (drawn.at(0, 0), drawn.at(1, 0));
+        assert!(b > r && far_r > far_b, "{:?} {:?}", drawn.at(0, 0), drawn.at(1, 0));
+        assert_eq!((drawn.at(2, 0), drawn.at(3, 0)), (colors::UNKNOWN, colors::UNKNOWN));
         let disparity = colorize(depth.view(), (1.0, 9.0), Colormap::TurboReversed);
-        assert_eq!((disparity.at(1, 0), disparity.at(0, 0)), (picture.at(0, 0), picture.at(1, 0)));
+        assert_eq!((disparity.at(1, 0), disparity.at(0, 0)), (drawn.at(0, 0), drawn.at(1, 0)));
     }
 
     #[test]
@@ -267,8 +267,8 @@ mod tests {
         #[test]
         fn any_map_can_be_drawn(w in 0usize..6, h in 0usize..6, values in prop::collection::vec(prop::num::f32::ANY, 36)) {
             let map = GrayF32::from_fn(w, h, |x, y| [values[y * 6 + x]]);
-            let picture = draw_map(map.view(), &MapStyle::depth("m"));
-            prop_assert!(picture.width() > w && picture.height() >= h);
+            let drawn = draw_map(map.view(), &MapStyle::depth("m"));
+            prop_assert!(drawn.width() > w && drawn.height() >= h);
         }
     }
 }

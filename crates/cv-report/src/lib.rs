@@ -8,8 +8,8 @@
 //! use cv_report::{MapStyle, Note, Plot, Report, draw_map};
 //!
 //! let depth = GrayF32::from_fn(64, 48, |x, _| [1.0 + x as f32 / 16.0]);
-//! let picture = draw_map(depth.view(), &MapStyle::depth("m"));
-//! assert!(picture.width() > 64);
+//! let figure = draw_map(depth.view(), &MapStyle::depth("m"));
+//! assert!(figure.width() > 64);
 //!
 //! let mut report = Report::new("Depth of a ramp");
 //! report.headline("valid", "100 %").section("Result").note(Note::Good, "Every pixel has a depth.");

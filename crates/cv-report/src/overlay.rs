@@ -330,18 +330,18 @@ mod tests {
     fn inliers_are_green_and_outliers_red_at_their_positions() {
         let (a, b) = (gray(40, 30), gray(50, 20));
         let pairs = [Correspondence::new(10.0, 10.0, 20.0, 5.0), Correspondence::new(10.0, 25.0, 20.0, 15.0)];
-        let picture = draw_matches(a.view(), b.view(), &pairs, Some(&[true, false]), &MatchStyle::default());
-        assert_eq!(picture.size(), (90, 30));
-        // The second picture is centered: 5 pixels down, 40 to the right.
+        let drawn = draw_matches(a.view(), b.view(), &pairs, Some(&[true, false]), &MatchStyle::default());
+        assert_eq!(drawn.size(), (90, 30));
+        // The second image is centered: 5 pixels down, 40 to the right.
         for (x, y, color) in
             [(10, 10, colors::GREEN), (60, 10, colors::GREEN), (10, 25, colors::RED), (60, 20, colors::RED)]
         {
-            let got = picture.at(x, y);
+            let got = drawn.at(x, y);
             assert!((0..3).all(|c| got[c].abs_diff(color[c]) < 8), "{x} {y}: {got:?}");
         }
         let only = MatchStyle { outliers: false, ..MatchStyle::default() };
-        let picture = draw_matches(a.view(), b.view(), &pairs, Some(&[true, false]), &only);
-        assert_eq!(picture.at(10, 25), picture.at(2, 2));
+        let drawn = draw_matches(a.view(), b.view(), &pairs, Some(&[true, false]), &only);
+        assert_eq!(drawn.at(10, 25), drawn.at(2, 2));
     }
 
     #[test]
@@ -350,10 +350,10 @@ mod tests {
         let f = Matrix3::new(0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0);
         let a = gray(60, 40);
         let pairs = [Correspondence::new(20.0, 12.0, 30.0, 12.0)];
-        let picture = draw_epipolar_lines(a.view(), a.view(), &f, &pairs, 5);
-        let marked = |x: usize, y: usize| picture.at(x, y) != picture.at(2, 38);
+        let drawn = draw_epipolar_lines(a.view(), a.view(), &f, &pairs, 5);
+        let marked = |x: usize, y: usize| drawn.at(x, y) != drawn.at(2, 38);
         assert!((0..60).all(|x| marked(x, 12)));
-        let start = picture.width() - 60;
+        let start = drawn.width() - 60;
         assert!((start..start + 60).all(|x| marked(x, 12)));
         assert!(!marked(50, 20) && !marked(start + 50, 3));
     }
@@ -361,10 +361,10 @@ mod tests {
     #[test]
     fn a_mask_overlay_has_blended_interior_and_solid_boundary() {
         let mask = Mask::from_fn(20, 20, |x, y| [(5..15).contains(&x) && (5..15).contains(&y)]);
-        let picture = overlay_mask(gray(20, 20).view(), mask.view(), [255, 0, 0], 0.5);
-        assert_eq!(picture.at(5, 8), [255, 0, 0]);
-        assert_eq!(picture.at(2, 2), [60; 3]);
-        let [r, g, _] = picture.at(10, 10);
+        let drawn = overlay_mask(gray(20, 20).view(), mask.view(), [255, 0, 0], 0.5);
+        assert_eq!(drawn.at(5, 8), [255, 0, 0]);
+        assert_eq!(drawn.at(2, 2), [60; 3]);
+        let [r, g, _] = drawn.at(10, 10);
         assert!(r.abs_diff(157) <= 2 && g.abs_diff(30) <= 2, "{r} {g}");
     }
 
@@ -372,19 +372,19 @@ mod tests {
     fn error_map_colors_by_error_class() {
         let estimate = cv_core::GrayF32::from_vec(4, 1, vec![1.0, 9.0, f32::NAN, 3.0]).unwrap();
         let truth = cv_core::GrayF32::from_vec(4, 1, vec![1.5, 1.0, 2.0, f32::NAN]).unwrap();
-        let picture = draw_error_map(estimate.view(), truth.view(), 2.0);
-        let [r, g, b] = picture.at(0, 0);
+        let drawn = draw_error_map(estimate.view(), truth.view(), 2.0);
+        let [r, g, b] = drawn.at(0, 0);
         assert!(r == g && g == b && r > 150);
-        assert!(picture.at(1, 0)[0] > 200 && picture.at(1, 0)[2] < 50);
-        assert!(picture.at(2, 0)[2] > 150 && picture.at(3, 0) == [0; 3]);
+        assert!(drawn.at(1, 0)[0] > 200 && drawn.at(1, 0)[2] < 50);
+        assert!(drawn.at(2, 0)[2] > 150 && drawn.at(3, 0) == [0; 3]);
     }
 
     #[test]
     fn patches_are_tiled_at_their_positions() {
-        let picture = tile_patches(&[0.0, 1.0, 0.5, f32::NAN, 2.0, 2.0, 2.0, 2.0, 7.0], 2, 8, 4);
+        let drawn = tile_patches(&[0.0, 1.0, 0.5, f32::NAN, 2.0, 2.0, 2.0, 2.0, 7.0], 2, 8, 4);
         let cell = 4 * 2 + 2;
-        assert_eq!(picture.size(), (2 * cell + 2, cell + 2));
-        assert_eq!((picture.at(2, 2), picture.at(6, 2), picture.at(6, 6)), ([0; 3], [255; 3], colors::UNKNOWN));
+        assert_eq!(drawn.size(), (2 * cell + 2, cell + 2));
+        assert_eq!((drawn.at(2, 2), drawn.at(6, 2), drawn.at(6, 6)), ([0; 3], [255; 3], colors::UNKNOWN));
         assert!(tile_patches(&[], 8, 4, 2).is_empty() && tile_patches(&[1.0], 0, 4, 2).is_empty());
     }
 

@@ -327,20 +327,20 @@ mod tests {
 
     #[test]
     fn cells_are_lighter_for_more_shared_points() {
-        let picture = draw_view_graph(&model(), 300);
+        let drawn = draw_view_graph(&model(), 300);
         let light = |[r, g, b]: Color| u32::from(r) + u32::from(g) + u32::from(b);
         let is_cell = |c: Color| c == Colormap::Viridis.color(1.0);
         // The pair with twenty shared points, in both triangles.
-        let bright: Vec<(usize, usize)> = (0..picture.height())
-            .flat_map(|y| (0..picture.width()).map(move |x| (x, y)))
-            .filter(|&(x, y)| is_cell(picture.at(x, y)) && y > 20)
+        let bright: Vec<(usize, usize)> = (0..drawn.height())
+            .flat_map(|y| (0..drawn.width()).map(move |x| (x, y)))
+            .filter(|&(x, y)| is_cell(drawn.at(x, y)) && y > 20)
             .collect();
         assert_eq!(bright.len(), 2 * 39 * 39);
         let (x, y) = bright[0];
         // Its neighbor to the right is the pair with the last photograph.
-        let five = picture.at(x + 40, y);
-        assert!(light(five) < light(picture.at(x, y)) && five != [228, 230, 234]);
-        assert_eq!(picture.at(x - 1 - 20, y), [45, 48, 56]);
+        let five = drawn.at(x + 40, y);
+        assert!(light(five) < light(drawn.at(x, y)) && five != [228, 230, 234]);
+        assert_eq!(drawn.at(x - 1 - 20, y), [45, 48, 56]);
         for empty in [SparseModel::default(), SparseModel { points: model().points, ..SparseModel::default() }] {
             assert!(draw_view_graph(&empty, 0).width() > 0 && draw_view_graph(&empty, 300).width() > 0);
         }

@@ -395,8 +395,8 @@ mod tests {
         let scene = PointScene::new(&PointCloud::colored(points.to_vec(), vec![[255, 0, 0]; 3]));
         assert_eq!(scene.points.len(), 1);
         for view in [Viewpoint::Camera, Viewpoint::Top, Viewpoint::Side] {
-            let picture = render_points(&scene, view, 101, 81);
-            assert!(picture.pixels().any(|p| p == [255, 0, 0]), "{view:?}");
+            let rendered = render_points(&scene, view, 101, 81);
+            assert!(rendered.pixels().any(|p| p == [255, 0, 0]), "{view:?}");
         }
         assert!(render_points(&scene, Viewpoint::Top, 0, 0).is_empty());
         assert!(!render_points(&PointScene::default(), Viewpoint::Camera, 20, 20).is_empty());
@@ -411,10 +411,10 @@ mod tests {
         points.extend([[1.0, 0.0, 1.0]; 6]);
         ink.extend([[255, 0, 0]; 6]);
         let scene = PointScene::new(&PointCloud::colored(points, ink));
-        let picture = render_points(&scene, Viewpoint::Top, 200, 200);
+        let rendered = render_points(&scene, Viewpoint::Top, 200, 200);
         let red: Vec<_> = (0..200)
             .flat_map(|y| (0..200).map(move |x| (x, y)))
-            .filter(|&(x, y)| picture.at(x, y) == [255, 0, 0])
+            .filter(|&(x, y)| rendered.at(x, y) == [255, 0, 0])
             .collect();
         assert!(!red.is_empty() && red.iter().all(|&(x, y)| x > 100 && y < 100), "{red:?}");
     }
@@ -444,9 +444,9 @@ mod tests {
             let pose = Pose::new(Rotation3::identity(), Vector3::new(-x, 0.0, 0.0));
             scene.add_camera(&camera, &pose, color);
         }
-        let picture = render_points(&scene, Viewpoint::Camera, 480, 300);
+        let rendered = render_points(&scene, Viewpoint::Camera, 480, 300);
         let span = |of: Color| {
-            let columns = (0..480).filter(|&x| (0..300).any(|y| picture.at(x, y) == of));
+            let columns = (0..480).filter(|&x| (0..300).any(|y| rendered.at(x, y) == of));
             columns.clone().max().unwrap_or(0) - columns.min().unwrap_or(480).min(480)
         };
         // From behind the cameras, about nine units away, it takes a quarter of the width of a view with a focal length of 2.2 half widths; a

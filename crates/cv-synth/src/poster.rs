@@ -21,7 +21,7 @@ enum Print {
     Landscape,
     /// Overlapping figures.
     Shapes(Vec<Figure>),
-    /// A headline above columns of text with a picture.
+    /// A headline above columns of text with an image.
     Sheet,
     /// Contour lines, woods, water and roads.
     Map,
@@ -181,8 +181,8 @@ impl Poster {
         if y > 0.0 && y < 0.09 * height {
             color = mix(color, paper, text(x, y, 0.07 * height, 0.82 * width, 0.8, self.seed ^ 77, w));
         }
-        // A picture at the right, text around it in two columns.
-        let picture = edge(u - 0.5 * width, w)
+        // An image at the right, text around it in two columns.
+        let image = edge(u - 0.5 * width, w)
             * edge(0.91 * width - u, w)
             * edge(v - 0.22 * height, w)
             * edge(0.52 * height - v, w);
@@ -190,12 +190,12 @@ impl Poster {
         let top = if u < 0.48 * width { 0.22 } else { 0.55 } * height;
         let size = 0.0135 * height;
         let ink = text(u - column.0, v - top, size, column.1, 0.5, self.seed ^ 8, w) * edge(0.93 * height - v, w);
-        color = mix(color, dark, ink * (1.0 - picture));
-        if picture > 0.0 {
+        color = mix(color, dark, ink * (1.0 - image));
+        if image > 0.0 {
             let bent = fbm(u, v, &Octaves::new(5.0 / width, 4, 0.6), self.seed ^ 2, w);
             let field = fbm(u + 0.1 * width * bent, v, &Octaves::new(9.0 / width, 6, 0.65), self.seed ^ 3, w);
             let tone = mix(mix(dark, cool, (0.9 + bent).clamp(0.0, 1.0)), gold, (0.4 + 0.8 * field).clamp(0.0, 1.0));
-            color = mix(color, tone, picture);
+            color = mix(color, tone, image);
         }
         color
     }

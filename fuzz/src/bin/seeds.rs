@@ -1,4 +1,4 @@
-//! Writes the first inputs of each target under `seeds/`: small files of every kind, made here. `cargo run --bin seeds`.
+//! Writes the seed corpus of each target under `seeds/`: small generated files of every kind. `cargo run --bin seeds`.
 
 use cv_core::{
     Camera, Distortion, DistortionModel, GrayF32, Image, Keypoint, PointCloud, Pose, RgbU8, Rotation3, StereoRig,
@@ -8,7 +8,7 @@ use cv_io::{CalibrationFormat, RigFile, npy, npz, pfm};
 #[cfg(feature = "pipelines")]
 use cv_pipeline::{Silent, segmentation::TrainOptions, train_segment};
 use exif::{Field, In, Rational, Tag, Value, experimental::Writer};
-// Built with the targets, its code counts coverage: the counters are in there.
+// The crates are instrumented for coverage, and libfuzzer-sys has the counters.
 use libfuzzer_sys as _;
 use std::{fs, io::Cursor, path::Path};
 
@@ -17,7 +17,7 @@ type Result<T> = std::result::Result<T, Box<dyn std::error::Error>>;
 fn main() -> Result<()> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("seeds");
     let mut total = 0;
-    let all = [pictures()?, blocks()?, maps()?, arrays()?, texts()?, structured()];
+    let all = [images()?, blocks()?, maps()?, arrays()?, texts()?, structured()];
     #[cfg(feature = "pipelines")]
     let all = all.into_iter().chain([models()?]);
     for (target, seeds) in all.into_iter().flatten() {
@@ -31,14 +31,14 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// A target and its inputs.
+/// Targets and their inputs.
 type Seeds = Vec<(&'static str, Vec<Vec<u8>>)>;
 
 fn ramp(w: usize, h: usize) -> RgbU8 {
     RgbU8::from_fn(w, h, |x, y| [(x * 20) as u8, (y * 30) as u8, (x * 7 + y * 11) as u8])
 }
 
-fn pictures() -> Result<Seeds> {
+fn images() -> Result<Seeds> {
     let image = ramp(12, 7);
     let deep: Image<u16, 3> = image.map(|p| p.map(|v| u16::from(v) * 257));
     let gray: Image<u8, 1> = image.map(|[r, _, _]| [r]);
@@ -168,7 +168,7 @@ fn bitmaps(image: &RgbU8) -> Vec<Vec<u8>> {
     vec![plain, masked, palette]
 }
 
-/// Each channel of a row as one literal run.
+/// Encodes each channel of a row as one literal run.
 fn hdr(image: &RgbU8) -> Vec<u8> {
     let (w, h) = image.size();
     let mut bytes = format!("#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {h} +X {w}\n").into_bytes();
@@ -281,11 +281,17 @@ fn texts() -> Result<Seeds> {
         ("matches", bytes(&matches)),
         ("features", bytes(&features)),
         ("places", bytes(&["a.jpg 1 -2.5 300\nb.jpg 0 0 0\n", "# c\nname,x,y,z\n\"b c.jpg\",0,1e3,-0 # d\n"])),
-        ("toml", bytes(&["threads = 2\n\n[sfm]\norder = \"sequence\"\ndistance = [\"a\", \"b\", 2.5]\n", "seed = 0x1f\n[depth]\nfill = false\n"])),
+        (
+            "toml",
+            bytes(&[
+                "threads = 2\n\n[sfm]\norder = \"sequence\"\ndistance = [\"a\", \"b\", 2.5]\n",
+                "seed = 0x1f\n[depth]\nfill = false\n",
+            ]),
+        ),
     ])
 }
 
-/// COLMAP's three binary files: two cameras, two pictures, a point.
+/// COLMAP's three binary files: two cameras, two images, a point.
 fn binary_model() -> Result<Vec<Vec<u8>>> {
     let text = std::env::temp_dir().join(format!("cv-seeds-{}", std::process::id()));
     std::fs::create_dir_all(&text)?;
@@ -323,7 +329,7 @@ fn models() -> Result<Seeds> {
     Ok(vec![("model", models), ("options", vec![options])])
 }
 
-/// Bytes without meaning: what they stand for is decided by `structured.rs`.
+/// Pseudorandom bytes, interpreted by `structured.rs`.
 fn structured() -> Seeds {
     let cloud = PointCloud::colored(vec![[1.0, 2.0, 3.0]; 3], vec![[1, 2, 3]; 3]);
     let targets = [

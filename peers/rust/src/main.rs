@@ -20,7 +20,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let (width, height) = (gray.width() as usize, gray.height() as usize);
     let size = ImageSize { width, height };
     let bytes = Image::<u8, 1>::from_size_slice(size, gray.as_raw())?;
-    // The conversion from bytes counts where a stage takes floats, into a buffer that is there, as for ours.
+    // The time includes the conversion from bytes where a stage takes floats, into a reused buffer, as for ours.
     let mut float = Image::<f32, 1>::from_size_val(size, 0.0)?;
     let convert = |float: &mut Image<f32, 1>| {
         float.as_slice_mut().iter_mut().zip(gray.as_raw()).for_each(|(f, b)| *f = f32::from(*b) * (1.0 / 255.0));
@@ -39,7 +39,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             let mut workspace = SiftWorkspace::new();
             let config = SiftConfig { n_features: 2000, ..SiftConfig::default() };
             fastest(5, || {
-                // Gray levels of 0 to 255 in floats, as it wants them.
+                // It expects gray levels from 0 to 255 as floats.
                 float.as_slice_mut().iter_mut().zip(gray.as_raw()).for_each(|(f, b)| *f = f32::from(*b));
                 let all = usize::MAX;
                 let pixels = float.as_slice();
@@ -77,7 +77,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Seconds of the fastest of `repeats` runs after one to warm up.
+/// Returns the seconds of the fastest of `repeats` runs after one warm-up run.
 fn fastest<T, E>(repeats: usize, mut call: impl FnMut() -> Result<T, E>) -> Result<f64, E> {
     call()?;
     let mut best = f64::INFINITY;
@@ -89,7 +89,7 @@ fn fastest<T, E>(repeats: usize, mut call: impl FnMut() -> Result<T, E>) -> Resu
     Ok(best)
 }
 
-/// Unit vectors from a linear congruential generator.
+/// Generates unit vectors from a linear congruential generator.
 fn descriptors<const D: usize>(count: usize, seed: u64) -> Vec<[f32; D]> {
     let mut state = seed;
     (0..count)

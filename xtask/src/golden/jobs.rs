@@ -1,9 +1,9 @@
 //! The pipelines on their fixtures.
 //!
-//! Bars against the truth are those the pipelines promise on generated scenes, wider where a sentence says why: these
-//! pictures are an eighth of a photograph's size, so an error of a given angle is fewer of their pixels. Tolerances
-//! against the past are what other machines may differ by: libraries of elementary functions and fused multiply-adds differ
-//! in the last bits, which can tip single matches and pixels.
+//! Targets against the ground truth are those of the pipelines on generated scenes; a comment gives the reason for a wider one. The
+//! images have an eighth of a photograph's width, so a given angular error is fewer pixels. Tolerances against the golden figures
+//! cover differences between machines: math libraries and fused multiply-adds differ in the last bits, which can change
+//! single matches and pixels.
 
 use super::{Figure, Job, Outcome};
 use crate::real::Check;
@@ -22,11 +22,11 @@ use std::path::Path;
 pub(super) const JOBS: &[Job] =
     &[("depth", stereo), ("plane", plane), ("panorama", views), ("reconstruct", two_views), ("segment", ball)];
 
-fn picture(fixtures: &Path, name: &str) -> Result<RgbU8> {
+fn read_image(fixtures: &Path, name: &str) -> Result<RgbU8> {
     Ok(cv_io::read_rgb(fixtures.join(name))?)
 }
 
-fn truth(fixtures: &Path, name: &str) -> Result<Value> {
+fn read_truth(fixtures: &Path, name: &str) -> Result<Value> {
     let path = fixtures.join("oracle").join(name);
     let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
     Ok(serde_json::from_str(&text)?)
@@ -44,8 +44,8 @@ fn matrix(value: &Value) -> Result<Matrix3<f64>> {
 }
 
 fn stereo(fixtures: &Path) -> Result<Outcome> {
-    let (left, right) = (picture(fixtures, "stereo/left.jpg")?, picture(fixtures, "stereo/right.jpg")?);
-    let known = truth(fixtures, "stereo.json")?;
+    let (left, right) = (read_image(fixtures, "stereo/left.jpg")?, read_image(fixtures, "stereo/right.jpg")?);
+    let known = read_truth(fixtures, "stereo.json")?;
     let (focal, baseline) = (number(&known, "focal_px")?, number(&known, "baseline_m")?);
     let geometry = StereoGeometry::from_focal(left.width(), left.height(), focal, baseline)?;
     let options =
@@ -60,7 +60,7 @@ fn stereo(fixtures: &Path) -> Result<Outcome> {
         result.map.disparity.pixels().map(|[d]| f64::from(d)).filter(|d| d.is_finite()).collect();
     let mean = disparities.iter().sum::<f64>() / disparities.len() as f64;
     Ok(Outcome {
-        checks: vec![Check::at_least("share of visible pixels within 5 % of the true depth", score.within, 0.95)],
+        checks: vec![Check::at_least("fraction of visible pixels within 5 % of the true depth", score.within, 0.95)],
         figures: vec![
             Figure { name: "within", value: score.within, tolerance: 0.002 },
             Figure { name: "valid_fraction", value: result.map.valid_fraction(), tolerance: 0.002 },
@@ -70,8 +70,8 @@ fn stereo(fixtures: &Path) -> Result<Outcome> {
 }
 
 fn plane(fixtures: &Path) -> Result<Outcome> {
-    let (a, b) = (picture(fixtures, "plane/a.jpg")?, picture(fixtures, "plane/b.jpg")?);
-    let known = matrix(&truth(fixtures, "plane.json")?["homography"])?;
+    let (a, b) = (read_image(fixtures, "plane/a.jpg")?, read_image(fixtures, "plane/b.jpg")?);
+    let known = matrix(&read_truth(fixtures, "plane.json")?["homography"])?;
     let found = match_photos(a.view(), b.view(), &MatchingOptions::default(), &Silent)?;
     let kind = ModelKind::Homography;
     let model = estimate(&found.pairs(), kind, &kind.options(), &Silent)?.robust;
@@ -87,10 +87,10 @@ fn plane(fixtures: &Path) -> Result<Outcome> {
 }
 
 fn views(fixtures: &Path) -> Result<Outcome> {
-    let pictures: Vec<RgbU8> =
-        (0..3).map(|i| picture(fixtures, &format!("panorama/view{i}.jpg"))).collect::<Result<_>>()?;
-    let known = truth(fixtures, "panorama.json")?;
-    let photos: Vec<PanoramaPhoto<'_>> = pictures.iter().map(|p| PanoramaPhoto::new(p.view())).collect();
+    let images: Vec<RgbU8> =
+        (0..3).map(|i| read_image(fixtures, &format!("panorama/view{i}.jpg"))).collect::<Result<_>>()?;
+    let known = read_truth(fixtures, "panorama.json")?;
+    let photos: Vec<PanoramaPhoto<'_>> = images.iter().map(|p| PanoramaPhoto::new(p.view())).collect();
     let result = panorama(&photos, &PanoramaOptions::default(), &Silent)?;
     let used = result.images.iter().filter(|image| image.used).count();
     let mut worst = 0.0f64;
@@ -100,12 +100,12 @@ fn views(fixtures: &Path) -> Result<Outcome> {
             |i: usize| result.alignment.views[i].as_ref().ok().with_context(|| format!("view {i} is not placed"));
         let (from, to) = (view(pair)?, view(pair + 1)?);
         let through = |p: Point2<f64>| to.project(&from.ray(p)?);
-        // The views are a third of a turn apart at most: nothing of one lies behind another.
+        // The views are at most 120° apart, so no pixel of one is behind another.
         let there = |p: Point2<f64>| {
             let q = homography * nalgebra::Vector3::new(p.x, p.y, 1.0);
             Some(Point2::new(q.x / q.z, q.y / q.z))
         };
-        let error = cv_synth::alignment_error(through, there, pictures[0].width(), pictures[0].height());
+        let error = cv_synth::alignment_error(through, there, images[0].width(), images[0].height());
         worst = worst.max(error.context("the views do not overlap")?);
     }
     let focal = result.images[1].focal.unwrap_or(f64::NAN);
@@ -129,8 +129,8 @@ fn views(fixtures: &Path) -> Result<Outcome> {
 }
 
 fn two_views(fixtures: &Path) -> Result<Outcome> {
-    let (a, b) = (picture(fixtures, "two-view/a.jpg")?, picture(fixtures, "two-view/b.jpg")?);
-    let known = truth(fixtures, "two-view.json")?;
+    let (a, b) = (read_image(fixtures, "two-view/a.jpg")?, read_image(fixtures, "two-view/b.jpg")?);
+    let known = read_truth(fixtures, "two-view.json")?;
     let camera = Camera::from_focal(a.width(), a.height(), number(&known, "focal_px")?);
     let options = ReconstructOptions::new(Intrinsics::Known([camera; 2]));
     let found = reconstruct(a.view(), b.view(), &options, &Silent)?;
@@ -138,16 +138,17 @@ fn two_views(fixtures: &Path) -> Result<Outcome> {
     let translation: Vec<f64> =
         known["translation_m"].as_array().into_iter().flatten().filter_map(Value::as_f64).collect();
     ensure!(translation.len() == 3, "no translation");
-    let turn = rotation_error(&found.scene.pose.rotation, &rotation).to_degrees();
-    let way = direction_error(&found.scene.pose.translation, &Vector3::from_column_slice(&translation)).to_degrees();
+    let rotation_error_deg = rotation_error(&found.scene.pose.rotation, &rotation).to_degrees();
+    let direction_error_deg =
+        direction_error(&found.scene.pose.translation, &Vector3::from_column_slice(&translation)).to_degrees();
     Ok(Outcome {
         checks: vec![
-            Check::at_most("error of the rotation, degrees", turn, 0.2),
-            Check::at_most("error of the direction of travel, degrees", way, 1.0),
+            Check::at_most("error of the rotation, degrees", rotation_error_deg, 0.2),
+            Check::at_most("error of the translation direction, degrees", direction_error_deg, 1.0),
         ],
         figures: vec![
-            Figure { name: "rotation_error_deg", value: turn, tolerance: 0.01 },
-            Figure { name: "direction_error_deg", value: way, tolerance: 0.1 },
+            Figure { name: "rotation_error_deg", value: rotation_error_deg, tolerance: 0.01 },
+            Figure { name: "direction_error_deg", value: direction_error_deg, tolerance: 0.1 },
             Figure { name: "points", value: found.scene.points.len() as f64, tolerance: 10.0 },
             Figure { name: "reprojection_rms_px", value: found.scene.reprojection_rms, tolerance: 0.02 },
         ],
@@ -158,7 +159,7 @@ fn ball(fixtures: &Path) -> Result<Outcome> {
     let photos: Vec<(RgbU8, Mask)> = (0..8)
         .map(|i| {
             let mask = cv_io::read_mask(fixtures.join(format!("oracle/ball-masks/ball{i}_mask.png")))?;
-            Ok((picture(fixtures, &format!("ball/ball{i}.jpg"))?, mask))
+            Ok((read_image(fixtures, &format!("ball/ball{i}.jpg"))?, mask))
         })
         .collect::<Result<_>>()?;
     let half: Vec<_> = photos.iter().step_by(2).map(|(photo, mask)| (photo.view(), mask.view())).collect();

@@ -1,6 +1,6 @@
-//! Undistorting and turning a pair of photographs, beside `remap` of both by fixed-point maps that are made once.
+//! Undistortion and rectification of a pair of images: ours and OpenCV's `remap` with precomputed fixed-point maps.
 
-use super::calibration::{Page, peer};
+use super::calibration::{Page, run_script};
 use super::features::Random;
 use crate::checks::Check;
 use anyhow::{Context, Result};
@@ -13,7 +13,7 @@ use std::time::Instant;
 
 const SIZE: (usize, usize) = (1280, 800);
 const REPEATS: usize = 100;
-/// Times that both take turns.
+/// Rounds in which both systems alternate.
 const ROUNDS: usize = 4;
 
 #[derive(Debug, Deserialize)]
@@ -23,8 +23,8 @@ struct Remap {
     seconds: f64,
 }
 
-/// Seconds of a pair on one thread and on two, and the first result.
-fn ours<const C: usize>(view: &RectifiedView, pair: &[Image<u8, C>; 2]) -> Result<([f64; 2], Image<u8, C>)> {
+/// Measures the seconds for a pair on one thread and on two; also returns the first image's result.
+fn run_ours<const C: usize>(view: &RectifiedView, pair: &[Image<u8, C>; 2]) -> Result<([f64; 2], Image<u8, C>)> {
     let maps = [view.map(&Silent)?, view.map(&Silent)?];
     let mut out = pair.clone();
     let mut best = [f64::INFINITY; 2];
@@ -45,8 +45,8 @@ fn ours<const C: usize>(view: &RectifiedView, pair: &[Image<u8, C>; 2]) -> Resul
     Ok((best, first))
 }
 
-/// Smooth spots with sharp edges among them.
-fn pictures<const C: usize>() -> [Image<u8, C>; 2] {
+/// Generates a pair of images: sums of sinusoids plus a checkerboard.
+fn generate_images<const C: usize>() -> [Image<u8, C>; 2] {
     [1, 2].map(|seed| {
         let mut random = Random(seed);
         let waves: Vec<[f32; 4]> = (0..6 * C).map(|_| std::array::from_fn(|_| random.next())).collect();
@@ -71,33 +71,37 @@ pub(super) fn run(python: &Path, page: &mut Page) -> Result<()> {
     let rotation = Rotation3::new(Vector3::new(0.01, 0.02, 0.005));
     let view = RectifiedView { source, camera: Camera { distortion: Distortion::NONE, ..source }, rotation };
     let scratch = tempfile::tempdir()?;
-    let (gray, color) = (pictures::<1>(), pictures::<3>());
+    let (gray, color) = (generate_images::<1>(), generate_images::<3>());
     for i in 0..2 {
         std::fs::write(scratch.path().join(format!("gray{i}.bytes")), gray[i].as_slice())?;
         std::fs::write(scratch.path().join(format!("rgb{i}.bytes")), color[i].as_slice())?;
     }
-    // By kind and threads.
+    // Best seconds, indexed by system, kind and threads.
     let mut best = [[[f64::INFINITY; 2]; 2]; 2];
     let mut means = [f64::NAN; 2];
     for _ in 0..ROUNDS {
-        let peers: Vec<Remap> = peer(python, &[&"remap", &SIZE.0.to_string(), &SIZE.1.to_string(), &scratch.path()])?;
+        let peers: Vec<Remap> =
+            run_script(python, &[&"remap", &SIZE.0.to_string(), &SIZE.1.to_string(), &scratch.path()])?;
         for p in &peers {
             let slot = &mut best[1][usize::from(p.kind == "rgb")][p.threads - 1];
             *slot = slot.min(p.seconds);
         }
-        let (a, b) = (ours(&view, &gray)?, ours(&view, &color)?);
+        let (a, b) = (run_ours(&view, &gray)?, run_ours(&view, &color)?);
         for (kind, times) in [a.0, b.0].into_iter().enumerate() {
             for (threads, seconds) in times.into_iter().enumerate() {
                 best[0][kind][threads] = best[0][kind][threads].min(seconds);
             }
         }
         let theirs = |name: &str| std::fs::read(scratch.path().join(name)).context("a result of the peer's");
-        means = [mean(a.1.as_slice(), &theirs("gray.result")?), mean(b.1.as_slice(), &theirs("rgb.result")?)];
+        means = [
+            mean_difference(a.1.as_slice(), &theirs("gray.result")?),
+            mean_difference(b.1.as_slice(), &theirs("rgb.result")?),
+        ];
     }
     let _ = writeln!(
         page.text,
-        "\nA pair of {}×{}, undistorted and turned in one pass, the maps made once; the fastest of {ROUNDS} times {REPEATS} runs, in turns. The results differ by {:.2} (gray) and \
-         {:.2} (RGB) levels on average: OpenCV's maps count in 1/32 px.\n\n| pixels | threads | ours, ms | OpenCV `remap`, ms | ratio |\n|---|---|---|---|---|",
+        "\nA pair of {}×{} undistorted and rectified in one pass with precomputed maps; the fastest of {ROUNDS} times {REPEATS} runs, alternating. The results differ by {:.2} (gray) and \
+         {:.2} (RGB) gray levels on average: OpenCV's maps are quantized to 1/32 px.\n\n| pixels | threads | ours, ms | OpenCV `remap`, ms | ratio |\n|---|---|---|---|---|",
         SIZE.0, SIZE.1, means[0], means[1]
     );
     let kinds = ["gray", "RGB"].into_iter().zip(best[0].iter().zip(&best[1]));
@@ -114,8 +118,8 @@ pub(super) fn run(python: &Path, page: &mut Page) -> Result<()> {
     Ok(())
 }
 
-/// Mean difference of two pictures in levels.
-fn mean(a: &[u8], b: &[u8]) -> f64 {
+/// Computes the mean absolute difference of two images in gray levels.
+fn mean_difference(a: &[u8], b: &[u8]) -> f64 {
     let sum: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
     sum / a.len().max(1) as f64
 }

@@ -12,20 +12,20 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 use serde::Deserialize;
 use std::{fmt::Write as _, path::Path, process::Command, time::Instant};
 
-/// Seeds (and orders of the input) that ours is averaged over.
+/// Seeds, each with its own order of the input, that our figures are averaged over.
 const SEEDS: u64 = 20;
-/// Repeats of which the fastest counts.
+/// Repeats; the fastest counts.
 const REPEATS: usize = 5;
-/// Generated problems of each kind; `CV_PEERS_PROBLEMS` changes it.
+/// Default number of generated problems of each kind; the environment variable `CV_PEERS_PROBLEMS` overrides it.
 const PROBLEMS: usize = 1000;
-const KINDS: [&str; 4] = ["general", "plane and parallax", "forward motion", "small base line"];
+const KINDS: [&str; 4] = ["general", "plane and parallax", "forward motion", "small baseline"];
 const MATCHES: usize = 300;
-/// Of the generated camera: 1200 × 900 px. The threshold is given to both.
+/// Focal length in pixels, size and inlier threshold in pixels of the generated problems.
 const FOCAL: f64 = 1000.0;
 const SIZE: (usize, usize) = (1200, 900);
 const THRESHOLD: f64 = 2.0;
 
-/// One method on one pair or problem.
+/// Result of one method on one pair or problem.
 #[derive(Debug, Clone, Deserialize)]
 struct Line {
     kind: String,
@@ -42,14 +42,14 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
         (0..KINDS.len()).flat_map(|kind| (0..problems as u64).map(move |seed| Problem::new(kind, seed))).collect();
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("problems.bin");
-    std::fs::write(&file, bytes(&generated))?;
+    std::fs::write(&file, encode_problems(&generated))?;
     println!("ours");
     let mut text = String::new();
     let mut ours = Vec::new();
     let mut spread = Vec::new();
     for (kind, model) in [("H", ModelKind::Homography), ("F", ModelKind::Fundamental)] {
         let pairs = load(&data.join(if kind == "H" { "homography" } else { "fundamental" }))?;
-        let (lines, deviation) = annotated(kind, model, &pairs)?;
+        let (lines, deviation) = run_annotated(kind, model, &pairs)?;
         ours.extend(lines);
         spread.push((kind, deviation));
     }
@@ -67,9 +67,9 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
 
     let _ = writeln!(
         text,
-        "Written by `cargo xtask peers geometry`; one run, load {} at its end (compare times as ratios). Input: rows with label 0; error: on \
-         the hand-checked rows, symmetric transfer RMS (H, threshold 3 px) or Sampson RMS (F, threshold 1 px). Ours: the mean over {SEEDS} seeds, each \
-         with the input in another order; the spread is the standard deviation of the mean error over them, as a share of it.\n",
+        "Written by `cargo xtask peers geometry`; one run, load {} at its end (compare times as ratios). Input: tentative matches (label 0); error: on \
+         the hand-checked matches (label 1), symmetric transfer RMS (H, threshold 3 px) or Sampson RMS (F, threshold 1 px). Ours: the mean over {SEEDS} seeds, each \
+         with another order of the input; the spread is the relative standard deviation of the mean error over the seeds.\n",
         super::machine_load()
     );
     let mut checks = Vec::new();
@@ -89,24 +89,24 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
             ["OpenCV USAC_ACCURATE", "PoseLib", "DEGENSAC"].iter().map(|n| of(n)[0]).fold(f64::INFINITY, f64::min);
         let maa = rows.iter().filter(|r| r.0 != "ours").map(|r| r.1[1]).fold(0.0, f64::max);
         let mine = of("ours");
-        let bars = [
-            ("mAA@10 below the best peer's by", maa - mine[1], 0.0),
+        let targets = [
+            ("mAA@10, best peer − ours", maa - mine[1], 0.0),
             ("median error / best of USAC_ACCURATE, PoseLib, DEGENSAC", mine[0] / best, 1.05),
             ("median time / OpenCV USAC_MAGSAC", mine[2] / of("OpenCV USAC_MAGSAC")[2], 1.0),
             ("spread over seeds and orders", *deviation, 0.05),
         ];
-        let _ = writeln!(text, "\n| {kind}: bar | measured | at most |\n|---|---|---|");
-        for (name, figure, bar) in bars {
-            let check = Check::at_most(format!("{kind}: {name}"), figure, bar + 1e-9);
-            let _ = writeln!(text, "| {name} | {figure:.3}{} | {bar} |", if check.ok { "" } else { " (missed)" });
+        let _ = writeln!(text, "\n| {kind}: figure | measured | at most |\n|---|---|---|");
+        for (name, figure, limit) in targets {
+            let check = Check::at_most(format!("{kind}: {name}"), figure, limit + 1e-9);
+            let _ = writeln!(text, "| {name} | {figure:.3}{} | {limit} |", if check.ok { "" } else { " (not met)" });
             checks.push(check);
         }
         text.push('\n');
     }
     let _ = writeln!(
         text,
-        "Generated relative poses, {problems} of each kind: {MATCHES} matches, 20 to 95 % wrong, noise 0.1 to 2 px, known camera, threshold {THRESHOLD} px. Error: the larger \
-         of the angles of rotation and direction.\n\n| kind | ours AUC 5°, 10°, 20° | PoseLib | ours, median ms | PoseLib |\n|---|---|---|---|---|"
+        "Generated relative poses, {problems} of each kind: {MATCHES} matches, 20 to 95 % outliers, noise 0.1 to 2 px, known camera, threshold {THRESHOLD} px. Error: the larger \
+         of the rotation error and the error of the translation direction.\n\n| kind | ours AUC 5°, 10°, 20° | PoseLib | ours, median ms | PoseLib |\n|---|---|---|---|---|"
     );
     for (kind, name) in KINDS.iter().enumerate() {
         let mine: Vec<(f64, f64)> = poses.iter().filter(|p| p.0 == kind).map(|p| (p.1, p.2)).collect();
@@ -114,9 +114,9 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
             peers.iter().filter(|l| l.kind == kind.to_string()).map(|l| (l.error, l.seconds)).collect();
         let show = |v: &[(f64, f64)]| [5.0, 10.0, 20.0].map(|limit| 100.0 * auc(v, limit));
         let (a, b) = (show(&mine), show(&theirs));
-        let ms = |v: &[(f64, f64)]| 1e3 * middle(v.iter().map(|p| p.1).collect());
-        for (limit, (ours, theirs)) in [5, 10, 20].into_iter().zip(a.iter().zip(&b)) {
-            checks.push(Check::at_most(format!("{name}: AUC {limit}° below PoseLib's by"), theirs - ours, 0.0));
+        let ms = |v: &[(f64, f64)]| 1e3 * median(v.iter().map(|p| p.1).collect());
+        for (degrees, (ours, theirs)) in [5, 10, 20].into_iter().zip(a.iter().zip(&b)) {
+            checks.push(Check::at_most(format!("{name}: AUC at {degrees}°, PoseLib − ours"), theirs - ours, 0.0));
         }
         checks.push(Check::at_most(format!("{name}: median time / PoseLib"), ms(&mine) / ms(&theirs), 1.0));
         let _ = writeln!(
@@ -137,8 +137,8 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
     Ok(checks)
 }
 
-/// Ours on every pair, averaged over seeds; and the spread of the mean error.
-fn annotated(kind: &str, model: ModelKind, pairs: &[Pair]) -> Result<(Vec<Line>, f64)> {
+/// Runs ours on every pair and seed; returns the results and the relative standard deviation of the mean error over the seeds.
+fn run_annotated(kind: &str, model: ModelKind, pairs: &[Pair]) -> Result<(Vec<Line>, f64)> {
     let mut lines = Vec::new();
     let mut means = vec![0.0; SEEDS as usize];
     for seed in 0..SEEDS {
@@ -171,7 +171,7 @@ fn annotated(kind: &str, model: ModelKind, pairs: &[Pair]) -> Result<(Vec<Line>,
     Ok((lines, variance.sqrt() / mean))
 }
 
-/// Median error, mAA@10 and median time in ms: of each seed, then averaged.
+/// Computes median error, mAA@10 and median time in ms for each seed and averages them.
 fn summary<'a>(lines: impl Iterator<Item = &'a Line>, kind: &str, method: &str) -> [f64; 3] {
     let mut runs: Vec<(String, Vec<(f64, f64)>)> = Vec::new();
     for line in lines.filter(|l| l.kind == kind && l.method == method) {
@@ -184,14 +184,14 @@ fn summary<'a>(lines: impl Iterator<Item = &'a Line>, kind: &str, method: &str) 
     let mut sums = [0.0; 3];
     for (_, run) in &runs {
         let errors: Vec<f64> = run.iter().map(|r| r.0).collect();
-        sums[0] += middle(errors.clone());
+        sums[0] += median(errors.clone());
         sums[1] += mean_average_accuracy(&errors);
-        sums[2] += 1e3 * middle(run.iter().map(|r| r.1).collect());
+        sums[2] += 1e3 * median(run.iter().map(|r| r.1).collect());
     }
     sums.map(|s| s / runs.len() as f64)
 }
 
-fn middle(mut v: Vec<f64>) -> f64 {
+fn median(mut v: Vec<f64>) -> f64 {
     if v.is_empty() {
         return f64::NAN;
     }
@@ -199,12 +199,12 @@ fn middle(mut v: Vec<f64>) -> f64 {
     (v[(v.len() - 1) / 2] + v[v.len() / 2]) / 2.0
 }
 
-/// Area under the curve of the share of errors below a limit, up to `limit` degrees, 0 to 1.
+/// Computes the area under the recall curve up to `limit` degrees, normalized to 0 to 1.
 fn auc(v: &[(f64, f64)], limit: f64) -> f64 {
     v.iter().map(|p| (1.0 - p.0 / limit).max(0.0)).sum::<f64>() / v.len() as f64
 }
 
-/// Two views of random points, some of them wrong.
+/// Matches of random points in two views, with outliers.
 struct Problem {
     kind: usize,
     pose: Pose,
@@ -217,7 +217,7 @@ impl Problem {
         let mut rng = ChaCha8Rng::seed_from_u64(seed * 4 + kind as u64);
         let mut u = || f64::from(rng.next_u32()) / 4294967296.0;
         let camera = Camera::from_focal(SIZE.0, SIZE.1, FOCAL);
-        let (wrong, noise) = (0.2 + 0.75 * u(), 0.1 * 20f64.powf(u()));
+        let (outlier_ratio, noise) = (0.2 + 0.75 * u(), 0.1 * 20f64.powf(u()));
         let mut g = || (-2.0 * u().max(1e-12).ln()).sqrt() * (std::f64::consts::TAU * u()).cos();
         let rotation = Rotation3::new(Vector3::new(0.1 * g(), 0.1 * g(), 0.1 * g()));
         let direction =
@@ -228,15 +228,16 @@ impl Problem {
         let mut matches = Vec::new();
         while matches.len() < MATCHES {
             let pixel = Point2::new(1200.0 * u() - 0.5, 900.0 * u() - 0.5);
-            if (matches.len() as f64) < wrong * MATCHES as f64 {
+            if (matches.len() as f64) < outlier_ratio * MATCHES as f64 {
                 matches.push(Correspondence { a: pixel, b: Point2::new(1200.0 * u() - 0.5, 900.0 * u() - 0.5) });
                 continue;
             }
             let ray = camera.normalize(pixel).to_homogeneous();
-            // Four in five points on the plane, for the second kind.
+            // Kind 1: four in five points on the plane.
             let depth = if kind == 1 && u() < 0.8 { 1.0 / plane.dot(&ray) } else { 4.0 + 8.0 * u() };
-            let seen = camera.project(&pose.transform(&Point3::from(ray * depth)));
-            let Some(b) = seen.filter(|b| depth > 0.5 && b.x > 0.0 && b.y > 0.0 && b.x < 1200.0 && b.y < 900.0) else {
+            let projection = camera.project(&pose.transform(&Point3::from(ray * depth)));
+            let Some(b) = projection.filter(|b| depth > 0.5 && b.x > 0.0 && b.y > 0.0 && b.x < 1200.0 && b.y < 900.0)
+            else {
                 continue;
             };
             let mut e = || noise * (-2.0 * u().max(1e-12).ln()).sqrt() * (std::f64::consts::TAU * u()).cos();
@@ -245,7 +246,7 @@ impl Problem {
         Self { kind, pose: Pose::new(rotation, direction), matches, seed }
     }
 
-    /// Kind, error in degrees, seconds.
+    /// Solves it with ours; returns the kind, the error in degrees and the seconds.
     fn solve(&self) -> (usize, f64, f64) {
         let camera = Camera::from_focal(SIZE.0, SIZE.1, FOCAL);
         let options = RobustOptions { threshold: THRESHOLD, seed: self.seed, ..RobustOptions::essential() };
@@ -253,15 +254,15 @@ impl Problem {
         let found = estimate_calibrated(&self.matches, &[camera; 2], &options, &Silent);
         let seconds = start.elapsed().as_secs_f64();
         let error = found.map_or(180.0, |f| {
-            let turn = cv_synth::rotation_error(&f.pose.rotation, &self.pose.rotation);
-            turn.max(cv_synth::direction_error(&f.pose.translation, &self.pose.translation)).to_degrees()
+            let rotation_error = cv_synth::rotation_error(&f.pose.rotation, &self.pose.rotation);
+            rotation_error.max(cv_synth::direction_error(&f.pose.translation, &self.pose.translation)).to_degrees()
         });
         (self.kind, error, seconds)
     }
 }
 
-/// What the script reads.
-fn bytes(problems: &[Problem]) -> Vec<u8> {
+/// Encodes the problems as the script reads them: little-endian f64.
+fn encode_problems(problems: &[Problem]) -> Vec<u8> {
     let mut numbers = vec![FOCAL, SIZE.0 as f64, SIZE.1 as f64, THRESHOLD];
     for p in problems {
         numbers.extend([p.kind as f64, p.matches.len() as f64]);

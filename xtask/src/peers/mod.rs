@@ -1,7 +1,7 @@
-//! Other systems and ours on the same inputs, side by side.
+//! Benchmarks of other systems and ours on the same inputs.
 //!
-//! One file per job; its scripts and the pinned versions live in `peers/` at the root, whose `.venv` is made on the first
-//! run. Register a job with one line in `JOBS`; it returns its figures with their bars.
+//! One file per job; its scripts and the pinned versions live in `peers/` at the root, whose `.venv` is created on the
+//! first run. Register a job with one line in `JOBS`; it returns its figures with their targets.
 
 mod adjust;
 mod calibration;
@@ -25,7 +25,7 @@ use std::{
     process::Command,
 };
 
-/// What a job does with the Python of the peers and the data folder.
+/// A job: from the Python interpreter of the peers and the data folder to its figures.
 type Job = fn(&Path, &Path) -> Result<Vec<Check>>;
 
 const JOBS: &[checks::Named<Job>] = &[
@@ -39,7 +39,7 @@ const JOBS: &[checks::Named<Job>] = &[
     ("panorama", panorama::run),
 ];
 
-/// Runs all jobs, or the one named; true where ours meets every bar.
+/// Runs all jobs, or the one named; true if ours meets every target.
 pub(crate) fn run(only: Option<&str>) -> Result<bool> {
     let jobs = checks::select(JOBS, only)?;
     let Some(data) = crate::data_dir() else {
@@ -52,7 +52,7 @@ pub(crate) fn run(only: Option<&str>) -> Result<bool> {
     Ok(checks::run(&jobs, |job| job(&python, &data)))
 }
 
-/// The Python that has the peers: `CV_PEERS_PYTHON`, else that of `peers/.venv`, made where it is missing.
+/// Returns the Python interpreter with the peers installed: `CV_PEERS_PYTHON`, else that of `peers/.venv`, which is created if missing.
 fn python() -> Result<PathBuf> {
     if let Some(python) = std::env::var_os("CV_PEERS_PYTHON") {
         return Ok(python.into());
@@ -60,18 +60,22 @@ fn python() -> Result<PathBuf> {
     let folder = crate::root().join("peers");
     let python = folder.join(".venv/bin/python");
     let stamp = folder.join(".venv/requirements.txt");
-    let wanted = std::fs::read_to_string(folder.join("requirements.txt")).context("peers/requirements.txt")?;
-    if std::fs::read_to_string(&stamp).is_ok_and(|have| have == wanted) {
+    let requirements = std::fs::read_to_string(folder.join("requirements.txt")).context("peers/requirements.txt")?;
+    if std::fs::read_to_string(&stamp).is_ok_and(|installed| installed == requirements) {
         return Ok(python);
     }
-    println!("making peers/.venv");
+    println!("creating peers/.venv");
     check(Command::new("python3").args(["-m", "venv"]).arg(folder.join(".venv")))?;
     check(Command::new(&python).args(["-m", "pip", "install", "--quiet", "-r"]).arg(folder.join("requirements.txt")))?;
-    std::fs::write(stamp, wanted)?;
+    std::fs::write(stamp, requirements)?;
     Ok(python)
 }
 
-/// Runs a program to its end; an error where it fails.
+/// Runs a program to its end.
+///
+/// # Errors
+///
+/// If it cannot be started or its exit status is not zero.
 pub(crate) fn check(command: &mut Command) -> Result<()> {
     let status = command.status().with_context(|| format!("cannot start {command:?}"))?;
     ensure!(status.success(), "{command:?} failed: {status}");
@@ -88,14 +92,14 @@ pub(crate) fn write_section(name: &str, text: &str) -> Result<()> {
 
 fn with_section(page: &str, name: &str, text: &str) -> String {
     let title = format!("## {name}");
-    let (mut before, mut after, mut inside, mut seen) = (String::new(), String::new(), false, false);
+    let (mut before, mut after, mut inside, mut has_section) = (String::new(), String::new(), false, false);
     for line in page.lines() {
         if line.starts_with("## ") {
             inside = line == title;
-            seen |= inside;
+            has_section |= inside;
         }
         if !inside {
-            let part = if seen { &mut after } else { &mut before };
+            let part = if has_section { &mut after } else { &mut before };
             part.push_str(line);
             part.push('\n');
         }
@@ -104,7 +108,7 @@ fn with_section(page: &str, name: &str, text: &str) -> String {
     format!("{}\n\n{title}\n\n{}\n{after}", before.trim_end(), text.trim())
 }
 
-/// Processor and number of cores.
+/// Returns the processor's name and the number of cores.
 pub(crate) fn machine() -> String {
     let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = info.lines().find_map(|line| line.strip_prefix("model name")).unwrap_or(": unknown processor");
@@ -112,7 +116,7 @@ pub(crate) fn machine() -> String {
     format!("{}, {cores} cores", name.trim_start_matches([' ', '\t', ':']))
 }
 
-/// How busy the machine was over the last minute: processes that ran or waited to; “unknown” where the system does not tell.
+/// Returns the load average of the last minute (runnable processes); “unknown” if the system has none.
 pub(crate) fn machine_load() -> String {
     let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
     load.split_whitespace().next().unwrap_or("unknown").to_owned()
@@ -123,7 +127,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_section_is_replaced_where_it_stands() {
+    fn a_section_is_replaced_in_place_or_appended() {
         let page = with_section("# Page\n\nIntro.\n\n## A\n\nold\n\n## B\n\nkept\n", "A", "new\n");
         assert_eq!(page, "# Page\n\nIntro.\n\n## A\n\nnew\n\n## B\n\nkept\n");
         assert_eq!(with_section(&page, "A", "new"), page);

@@ -1,32 +1,32 @@
-//! What a panorama of generated photographs is worth, by their truth.
+//! Accuracy of a panorama of generated photographs against ground truth: drift, PSNR, steps at seams.
 
 use anyhow::Result;
 use cv_core::{Camera, Distortion, Matrix3, Point2, Vector3};
 use cv_pipeline::{PanoramaOptions, PanoramaPhoto, PanoramaResult, Silent, panorama};
 use cv_synth::{Vista, VistaOptions, VistaPhoto, vista_photos, vista_response};
 
-/// A generated set: how it is taken, and the least PSNR asked of its panorama.
+/// A generated set: the spread of its exposures in EV and the smallest PSNR in dB required of its panorama.
 pub(super) struct Generated {
     spread: f32,
-    least_psnr: f64,
+    min_psnr: f64,
 }
 
-/// By name.
+/// The sets by name.
 pub(super) const SETS: [(&str, Generated); 2] = [
-    ("8 views, ±1 EV", Generated { spread: 1.0, least_psnr: 36.0 }),
-    ("8 views, ±2 EV", Generated { spread: 2.0, least_psnr: 34.0 }),
+    ("8 views, ±1 EV", Generated { spread: 1.0, min_psnr: 36.0 }),
+    ("8 views, ±2 EV", Generated { spread: 2.0, min_psnr: 34.0 }),
 ];
 
-/// What was measured; the worst of the seeds.
+/// Measured figures; the worst over the seeds.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Truth {
     pub(super) photographs: f64,
     pub(super) used: f64,
-    /// Median and 95 % of the blocks' displacements, in pixels.
+    /// Median and 95th percentile of the blocks' displacements, in pixels.
     pub(super) drift: (f64, f64),
     pub(super) psnr: f64,
-    pub(super) least_psnr: f64,
-    /// 95 % of the steps at seams, in gray levels.
+    pub(super) min_psnr: f64,
+    /// 95th percentile of the steps at seams, in gray levels.
     pub(super) step: f64,
 }
 
@@ -54,19 +54,19 @@ pub(super) fn measure(set: &Generated) -> Result<Truth> {
             drift.1,
             steps.len()
         );
-        let found = Truth { photographs: photos.len() as f64, used, drift, psnr, least_psnr: set.least_psnr, step };
-        worst = Some(worst.map_or(found, |w| Truth {
+        let figures = Truth { photographs: photos.len() as f64, used, drift, psnr, min_psnr: set.min_psnr, step };
+        worst = Some(worst.map_or(figures, |w| Truth {
             used: w.used.min(used),
             drift: (w.drift.0.max(drift.0), w.drift.1.max(drift.1)),
             psnr: w.psnr.min(psnr),
             step: w.step.max(step),
-            ..found
+            ..figures
         }));
     }
     worst.ok_or_else(|| anyhow::anyhow!("no seeds"))
 }
 
-/// The true direction of a pixel of the result, by where in its photograph it comes from.
+/// Returns the true world direction of a pixel of the panorama, from its source pixel in the photograph of its label.
 fn true_ray(photos: &[VistaPhoto], result: &PanoramaResult, x: f64, y: f64) -> Option<Vector3<f64>> {
     let label = usize::from(result.labels.at((x + 0.5) as usize, (y + 0.5) as usize)[0]);
     let source = result.map.source(label, Point2::new(x, y))?;
@@ -75,7 +75,7 @@ fn true_ray(photos: &[VistaPhoto], result: &PanoramaResult, x: f64, y: f64) -> O
     Some((photo.from_world.inverse() * Vector3::new(n.x, n.y, 1.0)).normalize())
 }
 
-/// Median and 95 % of how far, in pixels, blocks of 48 px lie from where they would in a panorama turned as a whole.
+/// Computes median and 95th percentile of the displacements of 48 px blocks, in pixels, after alignment by the best rotation.
 fn drift(photos: &[VistaPhoto], result: &PanoramaResult) -> (f64, f64) {
     let (w, h) = result.image.size();
     let mut pairs = Vec::new();
@@ -86,32 +86,33 @@ fn drift(photos: &[VistaPhoto], result: &PanoramaResult) -> (f64, f64) {
             }
         }
     }
-    let covariance = pairs.iter().fold(Matrix3::zeros(), |sum, (found, truth)| sum + truth * found.transpose());
+    let covariance = pairs.iter().fold(Matrix3::zeros(), |sum, (ray, truth)| sum + truth * ray.transpose());
     let Ok(svd) = cv_numeric::svd3(&covariance) else { return (f64::NAN, f64::NAN) };
-    let turn = svd.nearest_rotation().into_inner();
-    let mut off: Vec<f64> =
-        pairs.iter().map(|(found, truth)| (turn * found - truth).norm() * result.canvas.scale).collect();
-    off.sort_by(f64::total_cmp);
-    let at = |q: f64| off.get((off.len() as f64 * q) as usize).copied().unwrap_or(f64::NAN);
-    (at(0.5), at(0.95))
+    let rotation = svd.nearest_rotation().into_inner();
+    let mut displacements: Vec<f64> =
+        pairs.iter().map(|(ray, truth)| (rotation * ray - truth).norm() * result.canvas.scale).collect();
+    displacements.sort_by(f64::total_cmp);
+    let quantile = |q: f64| displacements.get((displacements.len() as f64 * q) as usize).copied().unwrap_or(f64::NAN);
+    (quantile(0.5), quantile(0.95))
 }
 
-/// Levels from which on a result may compress what photographs of other exposures show.
-const SHOULDER: u8 = 190;
+/// Gray level above which the result may compress highlights.
+const HIGHLIGHT_LEVEL: u8 = 190;
 
-/// Of what no photograph shows clipped and the result below its shoulder, after one gain per channel in linear light, in levels of the camera's own curve.
+/// Computes the PSNR in gray levels of the camera response, after one gain per channel on the radiance, over pixels that are clipped in no photograph and below
+/// [`HIGHLIGHT_LEVEL`] in the result.
 fn psnr(vista: &Vista, photos: &[VistaPhoto], result: &PanoramaResult) -> f64 {
     let (w, h) = result.image.size();
     let mut samples = Vec::new();
     for y in (2..h).step_by(3) {
         for x in (2..w).step_by(3) {
-            let (Some(ray), shown) = (true_ray(photos, result, x as f64, y as f64), result.image.at(x, y)) else {
+            let (Some(ray), level) = (true_ray(photos, result, x as f64, y as f64), result.image.at(x, y)) else {
                 continue;
             };
             let clipped = photos.iter().any(|p| {
-                let seen = p.from_world * ray;
-                let place = p.camera.project(&seen.into()).filter(|_| seen.z > 0.0);
-                place.is_some_and(|q| {
+                let point = p.from_world * ray;
+                let pixel = p.camera.project(&point.into()).filter(|_| point.z > 0.0);
+                pixel.is_some_and(|q| {
                     let inside = q.x >= 0.0
                         && q.y >= 0.0
                         && q.x < p.camera.width as f64 - 0.5
@@ -119,56 +120,56 @@ fn psnr(vista: &Vista, photos: &[VistaPhoto], result: &PanoramaResult) -> f64 {
                     inside && p.image.at((q.x + 0.5) as usize, (q.y + 0.5) as usize).iter().any(|v| *v >= 254)
                 })
             });
-            if !clipped && shown.iter().all(|v| *v < SHOULDER) {
-                // As a pixel of a camera does: the mean over its area.
+            if !clipped && level.iter().all(|v| *v < HIGHLIGHT_LEVEL) {
+                // The mean over the pixel's area.
                 let around = [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)];
                 let rays = around.map(|(dx, dy)| true_ray(photos, result, x as f64 + dx, y as f64 + dy));
-                let mut light = [0.0; 3];
+                let mut radiance = [0.0; 3];
                 for ray in rays {
                     let l = vista.radiance(&ray.unwrap_or_else(Vector3::z));
-                    (0..3).for_each(|c| light[c] += 0.25 * l[c]);
+                    (0..3).for_each(|c| radiance[c] += 0.25 * l[c]);
                 }
                 if rays.iter().all(Option::is_some) {
-                    samples.push((light, shown));
+                    samples.push((radiance, level));
                 }
             }
         }
     }
-    let error = |c: usize, gain: f64| {
-        let off = |(light, shown): &([f32; 3], [u8; 3])| {
-            let level = 255.0 * vista_response(light[c] * gain as f32, CONTRAST);
-            f64::from(level - f32::from(shown[c])).powi(2)
+    let mean_squared_error = |c: usize, gain: f64| {
+        let squared_error = |(radiance, level): &([f32; 3], [u8; 3])| {
+            let expected = 255.0 * vista_response(radiance[c] * gain as f32, CONTRAST);
+            f64::from(expected - f32::from(level[c])).powi(2)
         };
-        samples.iter().map(off).sum::<f64>() / samples.len().max(1) as f64
+        samples.iter().map(squared_error).sum::<f64>() / samples.len().max(1) as f64
     };
     let squares = (0..3).map(|c| {
         let (mut low, mut high) = (-3.0_f64, 3.0_f64);
         for _ in 0..30 {
             let (a, b) = (low + (high - low) / 3.0, high - (high - low) / 3.0);
-            if error(c, a.exp2()) < error(c, b.exp2()) { high = b } else { low = a }
+            if mean_squared_error(c, a.exp2()) < mean_squared_error(c, b.exp2()) { high = b } else { low = a }
         }
-        error(c, low.exp2())
+        mean_squared_error(c, low.exp2())
     });
     10.0 * (255.0 * 255.0 / (squares.sum::<f64>() / 3.0)).log10()
 }
 
-/// Side of the blocks whose means are compared across a seam.
-const BLOCK: usize = 32;
+/// Side in pixels of the blocks whose means are compared across a seam.
+const BLOCK_SIDE: usize = 32;
 
-/// The steps of means of 32 px blocks across the seams, in gray levels, where all of the blocks are smooth: what the slope on both sides does not explain. Ascending.
-/// Without blocks that their photograph shows clipped: how bright those are nobody knows.
+/// Computes the steps of the means of 32 px blocks across seams, in gray levels, after subtraction of the gradient on both sides; ascending. Only blocks of low variance
+/// count, and none with clipped source pixels, whose radiance is unknown.
 fn seam_steps(photos: &[VistaPhoto], result: &PanoramaResult) -> Vec<f64> {
     let (w, h) = result.labels.size();
     let block = |x: usize, y: usize, label: u16| -> Option<[f64; 3]> {
         let (mut sum, mut squares, mut n) = ([0.0; 3], [0.0; 3], 0.0);
-        for (x, y) in (y..y + BLOCK).step_by(2).flat_map(|y| (x..x + BLOCK).step_by(2).map(move |x| (x, y))) {
+        for (x, y) in (y..y + BLOCK_SIDE).step_by(2).flat_map(|y| (x..x + BLOCK_SIDE).step_by(2).map(move |x| (x, y))) {
             if result.labels.get(x, y)? != [label] {
                 continue;
             }
             let source = result.map.source(usize::from(label), Point2::new(x as f64, y as f64))?;
-            let taken =
+            let source_level =
                 photos.get(usize::from(label))?.image.get(source.x.round() as usize, source.y.round() as usize)?;
-            if taken.iter().any(|v| *v >= 250) {
+            if source_level.iter().any(|v| *v >= 250) {
                 return None;
             }
             let p = result.image.at(x, y).map(f64::from);
@@ -179,17 +180,18 @@ fn seam_steps(photos: &[VistaPhoto], result: &PanoramaResult) -> Vec<f64> {
             n += 1.0;
         }
         let smooth = (0..3).all(|c| squares[c] / n - (sum[c] / n).powi(2) < 16.0);
-        // At least half of the block lies on its side of the seam.
-        (n > 0.5 * (BLOCK * BLOCK / 4) as f64 && smooth).then(|| sum.map(|s| s / n))
+        // More than half of the block must be on its side of the seam.
+        (n > 0.5 * (BLOCK_SIDE * BLOCK_SIDE / 4) as f64 && smooth).then(|| sum.map(|s| s / n))
     };
     let mut steps = Vec::new();
-    for y in (0..h.saturating_sub(BLOCK)).step_by(BLOCK / 2) {
-        for x in 2 * BLOCK..w.saturating_sub(2 * BLOCK) {
-            let (a, b) = (result.labels.at(x - 1, y + BLOCK / 2)[0], result.labels.at(x, y + BLOCK / 2)[0]);
+    for y in (0..h.saturating_sub(BLOCK_SIDE)).step_by(BLOCK_SIDE / 2) {
+        for x in 2 * BLOCK_SIDE..w.saturating_sub(2 * BLOCK_SIDE) {
+            let (a, b) = (result.labels.at(x - 1, y + BLOCK_SIDE / 2)[0], result.labels.at(x, y + BLOCK_SIDE / 2)[0]);
             if a == b || a == u16::MAX || b == u16::MAX {
                 continue;
             }
-            let four = [(x - 2 * BLOCK, a), (x - BLOCK, a), (x, b), (x + BLOCK, b)].map(|(x, l)| block(x, y, l));
+            let four = [(x - 2 * BLOCK_SIDE, a), (x - BLOCK_SIDE, a), (x, b), (x + BLOCK_SIDE, b)]
+                .map(|(x, l)| block(x, y, l));
             if let [Some(m0), Some(m1), Some(m2), Some(m3)] = four {
                 let step = |c: usize| ((m2[c] - m1[c]) - 0.5 * ((m1[c] - m0[c]) + (m3[c] - m2[c]))).abs();
                 steps.push((step(0) + step(1) + step(2)) / 3.0);

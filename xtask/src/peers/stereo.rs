@@ -1,4 +1,4 @@
-//! OpenCV's matchers, Pandora and ours on the same pairs: ours and OpenCV's in turns (A B A B) within one run, Pandora,
+//! OpenCV's matchers, Pandora and ours on the same pairs: ours and OpenCV's alternating (A B A B) within one run; Pandora,
 //! which takes seconds, once. Writes the section "Stereo" of `docs/benchmarks.md`.
 
 use crate::checks::Check;
@@ -10,13 +10,13 @@ use cv_stereo::PathSums;
 use serde::Deserialize;
 use std::{fmt::Write as _, path::Path, process::Command, time::Instant};
 
-/// What a matcher reaches on a pair.
+/// Result of one matcher on one pair.
 #[derive(Debug, Clone, Deserialize)]
 struct Line {
     scene: String,
     mode: String,
     seconds: f64,
-    /// Share of the counted pixels with a disparity; for ours, with one that is matched and not filled.
+    /// Fraction of the evaluated pixels with a disparity; for ours, with a matched, not a filled one.
     density: f64,
     bad1: f64,
     bad2: f64,
@@ -39,15 +39,15 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
         println!("round {} of {ROUNDS}", round + 1);
         for scene in &SCENES {
             for (mode, paths) in [(OURS_8, Paths::Eight), (OURS_4, Paths::Four)] {
-                keep(&mut best, pool.install(|| ours(&folder, scene, mode, paths))?);
+                keep_fastest(&mut best, pool.install(|| run_ours(&folder, scene, mode, paths))?);
             }
         }
         for line in script(python, &scripts.join("stereo_opencv.py"), &[path_of(&folder)?])? {
-            keep(&mut best, line);
+            keep_fastest(&mut best, line);
         }
     }
     match script(python, &scripts.join("stereo_pandora.py"), &[path_of(&folder)?]) {
-        Ok(lines) => lines.into_iter().for_each(|line| keep(&mut best, line)),
+        Ok(lines) => lines.into_iter().for_each(|line| keep_fastest(&mut best, line)),
         Err(error) => println!("Pandora left out: {error:#}"),
     }
     let hh_bytes = memory_of_hh(python, &scripts, &folder)?;
@@ -58,21 +58,21 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
     let seconds =
         |mode: &str| best.iter().find(|l| l.scene == "motorcycle" && l.mode == mode).map_or(f64::NAN, |l| l.seconds);
     let (eight, four) = (seconds(OURS_8), seconds(OURS_4));
-    let bars = [
+    let targets = [
         ("8 paths with all checks / OpenCV 3WAY, 741×500×128", eight / seconds("3WAY"), 0.8),
         ("8 paths with all checks / OpenCV HH", eight / seconds("HH"), 0.2),
         ("4 paths with all checks / OpenCV 3WAY", four / seconds("3WAY"), 0.5),
         ("memory / OpenCV HH", our_bytes / hh_bytes, 0.6),
     ];
-    let mut section = page(&best, &bars, our_bytes, hh_bytes, &load);
-    pool.install(|| scaling(&mut section))?;
-    pool.install(|| bandwidth(&mut section, &folder, motorcycle))?;
+    let mut section = page(&best, &targets, our_bytes, hh_bytes, &load);
+    pool.install(|| measure_scaling(&mut section))?;
+    pool.install(|| measure_bandwidth(&mut section, &folder, motorcycle))?;
     print!("{section}");
     super::write_section("Stereo", &section)?;
-    Ok(bars.map(|(name, ratio, bar)| Check::at_most(name, ratio, bar)).to_vec())
+    Ok(targets.map(|(name, ratio, limit)| Check::at_most(name, ratio, limit)).to_vec())
 }
 
-/// Two threads, as the peers have.
+/// Builds a pool of two threads, the number that the peers use.
 fn two_threads() -> Result<rayon::ThreadPool> {
     rayon::ThreadPoolBuilder::new().num_threads(2).build().context("cannot start two threads")
 }
@@ -82,7 +82,7 @@ fn path_of(path: &Path) -> Result<&str> {
 }
 
 /// Keeps the faster of two runs of the same matcher on the same pair.
-fn keep(best: &mut Vec<Line>, line: Line) {
+fn keep_fastest(best: &mut Vec<Line>, line: Line) {
     match best.iter_mut().find(|l| l.scene == line.scene && l.mode == line.mode) {
         Some(known) if known.seconds <= line.seconds => {}
         Some(known) => *known = line,
@@ -114,16 +114,16 @@ fn memory_of_hh(python: &Path, scripts: &Path, folder: &Path) -> Result<f64> {
     Ok(serde_json::from_str::<Memory>(text.trim())?.bytes)
 }
 
-/// How long a matcher is repeated on a pair for its fastest run, and how often at the least; the scripts do the same. Runs
-/// of 10 ms are disturbed too often for three of them to tell.
+/// Seconds for which a matcher is repeated on a pair to find its fastest run, and the minimum number of repeats; the scripts use
+/// the same. Runs of 10 ms are disturbed too often for the fastest of three.
 const SECONDS: f64 = 0.5;
-const LEAST_REPEATS: usize = 4;
+const MIN_REPEATS: usize = 4;
 
-/// The fastest of some runs, the first of which only warms up.
-fn fastest(mut run: impl FnMut() -> Result<()>) -> Result<f64> {
+/// Returns the seconds of the fastest run; the first run only warms up.
+fn fastest_run(mut run: impl FnMut() -> Result<()>) -> Result<f64> {
     let (all, mut best) = (Instant::now(), f64::INFINITY);
     let mut repeats = 0;
-    while repeats < LEAST_REPEATS || all.elapsed().as_secs_f64() < SECONDS {
+    while repeats < MIN_REPEATS || all.elapsed().as_secs_f64() < SECONDS {
         let start = Instant::now();
         run()?;
         if repeats > 0 {
@@ -134,48 +134,48 @@ fn fastest(mut run: impl FnMut() -> Result<()>) -> Result<f64> {
     Ok(best)
 }
 
-/// Our matcher with its default options.
-fn ours(folder: &Path, scene: &Scene, mode: &str, paths: Paths) -> Result<Line> {
+/// Measures our matcher with its default options.
+fn run_ours(folder: &Path, scene: &Scene, mode: &str, paths: Paths) -> Result<Line> {
     let (truth, mask) = truth(folder, scene)?;
     let left = cv_io::read_rgb(folder.join(scene.left))?;
     let right = cv_io::read_rgb(folder.join(scene.right))?;
     let options = StereoOptions { disparities: scene.disparities, paths, ..Default::default() };
     let mut matcher = StereoMatcher::new(options)?;
     let mut map = DisparityMap::empty();
-    let seconds = fastest(|| Ok(matcher.compute_into(left.view(), right.view(), &mut map, &Silent)?))?;
+    let seconds = fastest_run(|| Ok(matcher.compute_into(left.view(), right.view(), &mut map, &Silent)?))?;
     let all = evaluate_disparity(map.disparity.view(), truth.view(), Some(mask.view()))?;
     let matched = cv_core::Mask::from_fn(mask.width(), mask.height(), |x, y| {
         [mask.at(x, y)[0] && map.state.at(x, y)[0] == PixelState::Matched]
     });
-    let sure = evaluate_disparity(map.disparity.view(), truth.view(), Some(matched.view()))?;
+    let matched_only = evaluate_disparity(map.disparity.view(), truth.view(), Some(matched.view()))?;
     Ok(Line {
         scene: scene.name.to_owned(),
         mode: mode.to_owned(),
         seconds,
-        density: sure.pixels as f64 / all.pixels as f64,
+        density: matched_only.pixels as f64 / all.pixels as f64,
         bad1: all.bad[1],
         bad2: all.bad[2],
-        bad2_of_valid: sure.bad[2],
+        bad2_of_valid: matched_only.bad[2],
         version: env!("CARGO_PKG_VERSION").to_owned(),
     })
 }
 
-fn page(lines: &[Line], bars: &[(&str, f64, f64)], our_bytes: f64, hh_bytes: f64, load: &str) -> String {
+fn page(lines: &[Line], targets: &[(&str, f64, f64)], our_bytes: f64, hh_bytes: f64, load: &str) -> String {
     let mut text =
         String::from("Written by `cargo xtask peers stereo`; every figure comes from one run on one machine.\n\n");
     let version = |mode: &str| lines.iter().find(|l| l.mode == mode).map_or("", |l| l.version.as_str());
     // `fmt::Write` on a String cannot fail.
     let _ = writeln!(
         text,
-        "{}, load {load} before the run (times are lower on an idle machine; compare them as ratios). Two threads, ours and OpenCV {} in \
-         turns, the fastest warm run of {ROUNDS} × {SECONDS} s; Pandora as a whole run, once.\n",
+        "{}, load {load} before the run (times are lower on an idle machine; compare them as ratios). Two threads, ours and OpenCV {} \
+         alternating, the fastest warm run of {ROUNDS} × {SECONDS} s; Pandora as a whole run, once.\n",
         super::machine(),
         version("3WAY"),
     );
     text.push_str(
-        "A pixel without a disparity counts as bad. Pixels: those both views see where the right truth is known (cones, cloth3), \
-         else all with truth.\nFor ours, density and “bad of those” are over matched pixels; bad-1.0 and bad-2.0 include the \
-         filled ones.\n\n| scene | matcher | bad-1.0 | bad-2.0 | density | bad-2.0 of those | time |\n|---|---|---|---|---|---|---|\n",
+        "A pixel without a disparity counts as bad. Evaluated pixels: those visible in both views if the right view has ground truth (cones, cloth3), \
+         else all with ground truth.\nFor ours, density and “bad-2.0 of valid” are over matched pixels; bad-1.0 and bad-2.0 include \
+         filled pixels.\n\n| scene | matcher | bad-1.0 | bad-2.0 | density | bad-2.0 of valid | time |\n|---|---|---|---|---|---|---|\n",
     );
     for scene in &SCENES {
         for line in lines.iter().filter(|l| l.scene == scene.name) {
@@ -194,19 +194,19 @@ fn page(lines: &[Line], bars: &[(&str, f64, f64)], our_bytes: f64, hh_bytes: f64
     }
     let _ = writeln!(
         text,
-        "\nWorking set at 741×500×128: ours {:.0} MiB, OpenCV HH {:.0} MiB (rise of the peak resident size).\n\n| ratio | measured | bar |\n|---|---|---|",
+        "\nWorking set at 741×500×128: ours {:.0} MiB, OpenCV HH {:.0} MiB (rise of the peak resident size).\n\n| ratio | measured | target |\n|---|---|---|",
         our_bytes / 1048576.0,
         hh_bytes / 1048576.0
     );
-    for (name, ratio, bar) in bars {
-        let _ = writeln!(text, "| {name} | {ratio:.2} | {bar} |");
+    for (name, ratio, limit) in targets {
+        let _ = writeln!(text, "| {name} | {ratio:.2} | {limit} |");
     }
     text
 }
 
-/// Time per pixel and disparity from a tenth of a megapixel to eight, all with the matcher's buffers at hand. The sizes take
-/// turns, so that what disturbs the machine for a while does not meet one of them alone.
-fn scaling(text: &mut String) -> Result<()> {
+/// Measures the time per pixel and disparity from 0.1 to 8 megapixels, with allocated buffers. The sizes alternate, so that a
+/// disturbance of the machine does not affect one size alone.
+fn measure_scaling(text: &mut String) -> Result<()> {
     const SIZES: [(usize, usize); 6] = [(366, 274), (742, 500), (1156, 866), (1634, 1224), (2312, 1730), (3264, 2450)];
     const PATHS: [Paths; 2] = [Paths::Eight, Paths::Four];
     let noise = |x: usize, y: usize| (x * 7919 + y * 104_729 + x * y % 97 * 31).wrapping_mul(2_654_435_761) >> 13;
@@ -218,7 +218,7 @@ fn scaling(text: &mut String) -> Result<()> {
                 let mut matcher = StereoMatcher::new(StereoOptions { paths, ..Default::default() })?;
                 let mut map = DisparityMap::empty();
                 let seconds =
-                    fastest(|| Ok(matcher.compute_into(pair[0].view(), pair[1].view(), &mut map, &Silent)?))?;
+                    fastest_run(|| Ok(matcher.compute_into(pair[0].view(), pair[1].view(), &mut map, &Silent)?))?;
                 *figure = figure.min(1e9 * seconds / (width * height * matcher.options().disparities) as f64);
             }
         }
@@ -233,15 +233,15 @@ fn scaling(text: &mut String) -> Result<()> {
     });
     let _ = writeln!(
         text,
-        "\nThe fastest warm run of {ROUNDS} × {SECONDS} s at each size, the sizes in turns. The slowest size is {a:.0} % (4 paths \
-         {b:.0} %) above the fastest; the bar is 15 %."
+        "\nThe fastest warm run of {ROUNDS} × {SECONDS} s at each size, the sizes alternating. The slowest size is {a:.0} % (4 paths \
+         {b:.0} %) above the fastest; the target is at most 15 %."
     );
     Ok(())
 }
 
-/// What aggregation takes against the time to stream its memory traffic: with costs and winners, and alone.
-fn bandwidth(text: &mut String, folder: &Path, scene: &Scene) -> Result<()> {
-    // Copies on both cores, as aggregation writes the sums once and reads them once.
+/// Compares the time of aggregation, with and without cost computation and winner-takes-all, with the time to copy as many bytes.
+fn measure_bandwidth(text: &mut String, folder: &Path, scene: &Scene) -> Result<()> {
+    // A copy on both cores: aggregation writes the sums once and reads them once.
     let from = vec![1u8; 256 << 20];
     let mut to = vec![0u8; from.len()];
     let mut seconds = f64::INFINITY;
@@ -258,8 +258,8 @@ fn bandwidth(text: &mut String, folder: &Path, scene: &Scene) -> Result<()> {
     let traffic = 2.0 * (left.width() * left.height() * scene.disparities) as f64;
     let _ = writeln!(
         text,
-        "\nCopying on both cores reaches {:.1} GB/s.\n\nThe stage `aggregate` makes the costs, twice, extends the paths, sums \
-         them up and picks the winners of both views. At 741×500×128 its sums are written once and read once, {:.0} MB, {:.1} ms at \
+        "\nCopying memory on both cores reaches {:.1} GB/s.\n\nThe stage `aggregate` computes the matching costs (twice), aggregates them along the paths, sums \
+         the path costs and selects the winners of both views. At 741×500×128 the sums are written once and read once: {:.0} MB, {:.1} ms at \
          that rate.",
         rate / 1e9,
         traffic / 1e6,
@@ -280,26 +280,26 @@ fn bandwidth(text: &mut String, folder: &Path, scene: &Scene) -> Result<()> {
         let stages = best.unwrap_or_default();
         let list: Vec<String> = stages.iter().map(|(stage, s)| format!("{stage} {:.1} ms", 1e3 * s)).collect();
         let ratio = stages.get(2).map_or(f64::NAN, |s| s.1 * rate / traffic);
-        let _ = writeln!(text, "{name} paths: {}; the whole stage is {ratio:.1} times the streaming.", list.join(", "));
+        let _ = writeln!(text, "{name} paths: {}; `aggregate` takes {ratio:.1} times the copy time.", list.join(", "));
     }
     let gray = cv_imgproc::rgb_to_gray(left.view());
     text.push_str(
-        "\nAggregation alone: costs are given, and nobody picks winners. Each of the two sweeps reads the costs of all pixels, \
-         extends its half of the paths and writes their sums.\n",
+        "\nAggregation alone, from precomputed costs and without winner-takes-all: each of the two passes reads the costs of all pixels, \
+         aggregates along half of the paths and writes the sums.\n",
     );
     for (name, paths) in [("8", Paths::Eight), ("4", Paths::Four)] {
         let options = StereoOptions { disparities: scene.disparities, paths, ..Default::default() };
-        // As many values as census bits have; no time depends on them.
+        // Costs in the range of the census distance; the time does not depend on them.
         let mut sums =
             PathSums::new(options, gray.view(), |x, y, k| ((x * 7919 + y * 104_729 + k * 31) % 97 % 25) as u8)?;
-        let seconds = fastest(|| {
+        let seconds = fastest_run(|| {
             sums.run(&Silent)?;
             Ok(())
         })?;
         let (traffic, ratio) = (sums.traffic() as f64, seconds * rate / sums.traffic() as f64);
         let _ = writeln!(
             text,
-            "{name} paths: {:.1} ms; {:.0} MB take {:.1} ms to stream; {ratio:.1} times the streaming (the bar is 2).",
+            "{name} paths: {:.1} ms; copying {:.0} MB takes {:.1} ms; ratio {ratio:.1} (target: at most 2).",
             1e3 * seconds,
             traffic / 1e6,
             1e3 * traffic / rate,

@@ -1,5 +1,5 @@
-//! OpenCV's matchers, Pandora and ours on every pair with truth, by group, the worst pairs first. Writes the section
-//! "Stereo by group" of `docs/benchmarks.md`. No times: those are the job `stereo`'s.
+//! OpenCV's matchers, Pandora and ours on every pair with ground truth, by group, the worst pairs first. Writes the section
+//! "Stereo by group" of `docs/benchmarks.md`. The job `stereo` measures times.
 
 use crate::checks::Check;
 use crate::real::depth::{SCENES, truth};
@@ -10,59 +10,62 @@ use cv_pipeline::{DepthOptions, depth};
 use serde::Deserialize;
 use std::{collections::BTreeMap, fmt::Write as _, fs, path::Path, process::Command};
 
-/// What a peer reaches on a pair: shares of pixels off by more than 2 px.
+/// Result of a peer on a pair: fractions of pixels with an error above 2 px.
 #[derive(Debug, Clone, Deserialize)]
 struct Line {
     scene: String,
     mode: String,
-    seen: f64,
+    visible: f64,
     all: f64,
 }
 
-/// `scene.json`.
+/// Contents of `scene.json`.
 #[derive(Debug, Deserialize)]
-struct About {
+struct PairInfo {
     group: String,
     disparities: usize,
     min: i32,
 }
 
-/// A pair with its truth, and the pixels that both photographs see.
+/// A pair with its ground truth, and the mask of the pixels visible in both views.
 struct Pair {
     name: String,
-    about: About,
+    info: PairInfo,
     photos: [RgbU8; 2],
     truth: GrayF32,
-    seen: Mask,
+    visible: Mask,
 }
 
-/// Percentages of ours.
+/// Our figures on a pair, in percent.
 #[derive(Debug, Clone, Copy, Default)]
 struct Ours {
-    half: f64,
-    seen: f64,
+    /// bad-0.5 of the visible pixels.
+    bad_half: f64,
+    /// bad-2.0 of the visible pixels, and of all with ground truth.
+    visible: f64,
     all: f64,
-    outliers: f64,
+    /// D1 of all.
+    d1: f64,
     matched: f64,
-    occluded: Share,
-    outside: Share,
+    occluded: BadCount,
+    out_of_view: BadCount,
 }
 
-/// Wrong pixels of all.
+/// Numbers of bad and of all pixels.
 #[derive(Debug, Clone, Copy, Default)]
-struct Share {
-    wrong: f64,
-    of: f64,
+struct BadCount {
+    bad: f64,
+    total: f64,
 }
 
-impl Share {
-    fn add(&mut self, wrong: bool) {
-        self.wrong += f64::from(wrong);
-        self.of += 1.0;
+impl BadCount {
+    fn add(&mut self, is_bad: bool) {
+        self.bad += f64::from(is_bad);
+        self.total += 1.0;
     }
 
     fn percent(self) -> f64 {
-        100.0 * self.wrong / self.of.max(1.0)
+        100.0 * self.bad / self.total.max(1.0)
     }
 }
 
@@ -76,50 +79,53 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
         .map(|line| serde_json::from_str(line).with_context(|| line.to_owned()))
         .collect::<Result<_>>()?;
     let mut groups: BTreeMap<String, Vec<(String, Ours)>> = BTreeMap::new();
-    for pair in pairs(data)? {
+    for pair in read_pairs(data)? {
         let ours = score(&pair)?;
-        println!("{:22} {:5.2} % of what both see, {:5.2} % of all", pair.name, ours.seen, ours.all);
-        groups.entry(pair.about.group).or_default().push((pair.name, ours));
+        println!(
+            "{:22} {:5.2} % of the pixels visible in both views, {:5.2} % of all",
+            pair.name, ours.visible, ours.all
+        );
+        groups.entry(pair.info.group).or_default().push((pair.name, ours));
     }
-    let best = |scene: &str, opencv: bool, of: fn(&Line) -> f64| {
+    let best = |scene: &str, opencv: bool, figure: fn(&Line) -> f64| {
         let lines = peers.iter().filter(|line| line.scene == scene && (line.mode == "Pandora") != opencv);
-        lines.map(of).reduce(f64::min).map(|share| 100.0 * share)
+        lines.map(figure).reduce(f64::min).map(|fraction| 100.0 * fraction)
     };
     let mut text = String::from(
-        "Written by `cargo xtask peers stereo-groups`. Percent of pixels that are off by more than 2 px or have no disparity: of those that both \
-         photographs see, and of all with truth. OpenCV: the best of SGBM, HH, 3WAY and HH4 on the pair. `bad-0.5` and `D1` (more than 3 px \
-         and 5 % of the disparity, of all) are ours; so are `matched`, the share that passed every check, and what is wrong of the occluded \
-         pixels and of those outside the right photograph.\n\n\
-         | pair | ours, seen (all) | OpenCV's best | Pandora | bad-0.5 | D1 | matched | occluded wrong | outside wrong |\n|---|---|---|---|---|---|---|---|---|\n",
+        "Written by `cargo xtask peers stereo-groups`. bad-2.0 in percent (error above 2 px or no disparity): of the pixels visible in both \
+         views, and of all with ground truth. OpenCV: the best of SGBM, HH, 3WAY and HH4 on the pair. `bad-0.5`, `D1` (error above 3 px \
+         and 5 % of the disparity, of all), `matched` (percent of the visible pixels that passed every check) and bad-2.0 of the occluded \
+         pixels and of those out of the right view are ours.\n\n\
+         | pair | ours, visible (all) | OpenCV's best | Pandora | bad-0.5 | D1 | matched | bad-2.0, occluded | bad-2.0, out of view |\n|---|---|---|---|---|---|---|---|---|\n",
     );
     let mut checks = Vec::new();
     for (group, scenes) in &mut groups {
-        scenes.sort_by(|a, b| b.1.seen.total_cmp(&a.1.seen));
-        let cell = |share: Option<f64>| share.map_or_else(String::new, |share| format!("{share:.1}"));
+        scenes.sort_by(|a, b| b.1.visible.total_cmp(&a.1.visible));
+        let cell = |percent: Option<f64>| percent.map_or_else(String::new, |percent| format!("{percent:.1}"));
         let mut sum = Ours::default();
         for (name, ours) in &*scenes {
             let peer = |opencv| {
-                let (seen, all) = (best(name, opencv, |l| l.seen), best(name, opencv, |l| l.all));
-                (seen, format!("{} ({})", cell(seen), cell(all)))
+                let (visible, all) = (best(name, opencv, |l| l.visible), best(name, opencv, |l| l.all));
+                (visible, format!("{} ({})", cell(visible), cell(all)))
             };
             let ((opencv, opencv_cell), (pandora, pandora_cell)) = (peer(true), peer(false));
             row(&mut text, name, ours, &opencv_cell, &pandora_cell);
-            for (who, share) in [("OpenCV's best", opencv), ("Pandora", pandora)] {
-                if let Some(share) = share {
-                    checks.push(Check::at_most(format!("{name} bad-2.0 %, {who}"), ours.seen, share));
+            for (who, percent) in [("OpenCV's best", opencv), ("Pandora", pandora)] {
+                if let Some(percent) = percent {
+                    checks.push(Check::at_most(format!("{name} bad-2.0 %, {who}"), ours.visible, percent));
                 }
             }
             let n = scenes.len() as f64;
             let mean = |sum: &mut f64, value: f64| *sum += value / n;
-            mean(&mut sum.half, ours.half);
-            mean(&mut sum.seen, ours.seen);
+            mean(&mut sum.bad_half, ours.bad_half);
+            mean(&mut sum.visible, ours.visible);
             mean(&mut sum.all, ours.all);
-            mean(&mut sum.outliers, ours.outliers);
+            mean(&mut sum.d1, ours.d1);
             mean(&mut sum.matched, ours.matched);
-            sum.occluded.wrong += ours.occluded.wrong;
-            sum.occluded.of += ours.occluded.of;
-            sum.outside.wrong += ours.outside.wrong;
-            sum.outside.of += ours.outside.of;
+            sum.occluded.bad += ours.occluded.bad;
+            sum.occluded.total += ours.occluded.total;
+            sum.out_of_view.bad += ours.out_of_view.bad;
+            sum.out_of_view.total += ours.out_of_view.total;
         }
         row(&mut text, &format!("**{group}**, mean"), &sum, "", "");
     }
@@ -130,79 +136,80 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
 
 fn row(text: &mut String, name: &str, ours: &Ours, opencv: &str, pandora: &str) {
     // `fmt::Write` on a String cannot fail.
-    let share = |share: Share| if share.of > 0.0 { format!("{:.0}", share.percent()) } else { String::new() };
+    let percent = |count: BadCount| if count.total > 0.0 { format!("{:.0}", count.percent()) } else { String::new() };
     let _ = writeln!(
         text,
         "| {name} | {:.2} ({:.1}) | {opencv} | {pandora} | {:.1} | {:.1} | {:.0} | {} | {} |",
-        ours.seen,
+        ours.visible,
         ours.all,
-        ours.half,
-        ours.outliers,
+        ours.bad_half,
+        ours.d1,
         ours.matched,
-        share(ours.occluded),
-        share(ours.outside)
+        percent(ours.occluded),
+        percent(ours.out_of_view)
     );
 }
 
-/// Every pair with truth.
-fn pairs(data: &Path) -> Result<Vec<Pair>> {
+/// Reads every pair with ground truth.
+fn read_pairs(data: &Path) -> Result<Vec<Pair>> {
     let mut pairs = Vec::new();
     let folder = data.join("stereo");
     for scene in &SCENES {
-        let (truth, seen) = truth(&folder, scene)?;
-        let about = About { group: "stereo".to_owned(), disparities: scene.disparities, min: 0 };
+        let (truth, visible) = truth(&folder, scene)?;
+        let info = PairInfo { group: "stereo".to_owned(), disparities: scene.disparities, min: 0 };
         let photos = [cv_io::read_rgb(folder.join(scene.left))?, cv_io::read_rgb(folder.join(scene.right))?];
-        pairs.push(Pair { name: scene.name.to_owned(), about, photos, truth, seen });
+        pairs.push(Pair { name: scene.name.to_owned(), info, photos, truth, visible });
     }
     let mut folders: Vec<_> = fs::read_dir(data.join("stereo-more"))?.map(|f| Ok(f?.path())).collect::<Result<_>>()?;
     folders.sort();
     for folder in folders.iter().filter(|folder| folder.join("scene.json").exists()) {
         let name = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let about = serde_json::from_str(&fs::read_to_string(folder.join("scene.json"))?)?;
+        let info = serde_json::from_str(&fs::read_to_string(folder.join("scene.json"))?)?;
         let photos = [cv_io::read_rgb(folder.join("left.png"))?, cv_io::read_rgb(folder.join("right.png"))?];
         let truth = match folder.join("truth.png") {
             path if path.exists() => cv_io::scaled::read(path, 256.0)?,
             _ => cv_io::read_map(folder.join("truth.npz"), None)?,
         };
-        let seen = match folder.join("mask.png") {
+        let visible = match folder.join("mask.png") {
             path if path.exists() => cv_io::read_mask(path)?,
             _ => Mask::new(truth.width(), truth.height(), [true]),
         };
-        pairs.push(Pair { name, about, photos, truth, seen });
+        pairs.push(Pair { name, info, photos, truth, visible });
     }
     Ok(pairs)
 }
 
-/// Ours as `cv depth` has it, with default options but for the range: rows aligned.
+/// Scores our `depth` on a pair, with default options but for the disparity range.
 fn score(pair: &Pair) -> Result<Ours> {
-    let About { disparities, min, .. } = pair.about;
+    let PairInfo { disparities, min, .. } = pair.info;
     let stereo = StereoOptions { disparities, min_disparity: min, ..Default::default() };
     let options = DepthOptions { stereo, ..Default::default() };
     let map = depth(pair.photos[0].view(), pair.photos[1].view(), None, &options, &Silent)?.map;
-    let [mut half, mut seen, mut all, mut outliers, mut matched, mut occluded, mut outside] = [Share::default(); 7];
+    let [mut bad_half, mut visible, mut all, mut d1, mut matched, mut occluded, mut out_of_view] =
+        [BadCount::default(); 7];
     for y in 0..pair.truth.height() {
         for x in 0..pair.truth.width() {
             let truth = pair.truth.at(x, y)[0];
             if !truth.is_finite() {
                 continue;
             }
-            let off = (map.disparity.at(x, y)[0] - truth).abs();
-            // Without a disparity: infinitely far.
-            let off = if off.is_nan() { f32::INFINITY } else { off };
-            all.add(off > 2.0);
-            outliers.add(off > 3.0 && off > 0.05 * truth.abs());
-            if pair.seen.at(x, y)[0] {
-                half.add(off > 0.5);
-                seen.add(off > 2.0);
+            let error = (map.disparity.at(x, y)[0] - truth).abs();
+            // A pixel without a disparity counts as bad.
+            let error = if error.is_nan() { f32::INFINITY } else { error };
+            all.add(error > 2.0);
+            d1.add(error > 3.0 && error > 0.05 * truth.abs());
+            if pair.visible.at(x, y)[0] {
+                bad_half.add(error > 0.5);
+                visible.add(error > 2.0);
                 matched.add(map.state.at(x, y)[0] == PixelState::Matched);
             }
             if (x as f32) < truth - 0.5 {
-                outside.add(off > 2.0);
-            } else if !pair.seen.at(x, y)[0] {
-                occluded.add(off > 2.0);
+                out_of_view.add(error > 2.0);
+            } else if !pair.visible.at(x, y)[0] {
+                occluded.add(error > 2.0);
             }
         }
     }
-    let [half, seen, all, outliers, matched] = [half, seen, all, outliers, matched].map(Share::percent);
-    Ok(Ours { half, seen, all, outliers, matched, occluded, outside })
+    let [bad_half, visible, all, d1, matched] = [bad_half, visible, all, d1, matched].map(BadCount::percent);
+    Ok(Ours { bad_half, visible, all, d1, matched, occluded, out_of_view })
 }

@@ -1,25 +1,25 @@
-//! From images alone to a model: `cv match` and `cv estimate` on annotated pairs; hand-checked points are the judge.
+//! `cv match` and `cv estimate` on annotated pairs, from images to a model; hand-checked matches are the ground truth.
 
 use super::{Check, estimate as annotated};
 use anyhow::{Context, Result};
 use cv_pipeline::{MatchingOptions, ModelKind, RobustOptions, Silent, estimate, match_photos};
 use std::path::{Path, PathBuf};
 
-/// RANSAC draws at random: these seeds, and the figures are the medians over them.
+/// Seeds of RANSAC; the figures are medians over them.
 const SEEDS: u64 = 9;
 
-/// Bars: what OpenCV's SIFT with 4000 points, ratio 0.8 and USAC_ACCURATE reaches on the same pairs.
+/// The targets are the figures of OpenCV's SIFT (4000 features, ratio 0.8) with USAC_ACCURATE on the same pairs.
 pub(super) fn run(data: &Path) -> Result<Vec<Check>> {
     let mut checks = Vec::new();
-    for (kind, folder, name, success_bar, median_bar, accuracy_bar) in [
+    for (kind, folder, name, min_successes, max_median, min_accuracy) in [
         (ModelKind::Homography, "homography", "H", 7.0, 2.18, 0.725),
         (ModelKind::Fundamental, "fundamental", "F", 6.0, 0.58, 0.814),
     ] {
         let folder = data.join(folder);
-        // By seed, the error of each pair.
+        // Error of each pair, by seed.
         let mut errors = vec![Vec::new(); SEEDS as usize];
         for pair in annotated::load(&folder)? {
-            let [a, b] = [photo(&folder, &pair.name, "A")?, photo(&folder, &pair.name, "B")?];
+            let [a, b] = [photo_path(&folder, &pair.name, "A")?, photo_path(&folder, &pair.name, "B")?];
             let (a, b) = (cv_io::read_rgb(a)?, cv_io::read_rgb(b)?);
             let matched = match_photos(a.view(), b.view(), &MatchingOptions::default(), &Silent);
             let mut line = format!("{name} {:12}", pair.name);
@@ -43,28 +43,28 @@ pub(super) fn run(data: &Path) -> Result<Vec<Check>> {
         }
         let over_seeds = |figure: &dyn Fn(&[f64]) -> f64| median(errors.iter().map(|e| figure(e)).collect());
         let success = over_seeds(&|e| e.iter().filter(|e| **e < 10.0).count() as f64);
-        checks.push(Check::at_least(format!("{name} pairs under 10 px"), success, success_bar));
+        checks.push(Check::at_least(format!("{name} pairs under 10 px"), success, min_successes));
         checks.push(Check::at_most(
             format!("{name} median error, px"),
             over_seeds(&|e| median(e.to_vec())),
-            median_bar,
+            max_median,
         ));
         let accuracy = over_seeds(&annotated::mean_average_accuracy);
-        checks.push(Check::at_least(format!("{name} mAA at 1 to 10 px"), accuracy, accuracy_bar));
+        checks.push(Check::at_least(format!("{name} mAA at 1 to 10 px"), accuracy, min_accuracy));
     }
     Ok(checks)
 }
 
-fn median(mut of: Vec<f64>) -> f64 {
-    of.sort_by(f64::total_cmp);
-    let n = of.len();
-    if n == 0 { f64::NAN } else { (of[(n - 1) / 2] + of[n / 2]) / 2.0 }
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    let n = values.len();
+    if n == 0 { f64::NAN } else { (values[(n - 1) / 2] + values[n / 2]) / 2.0 }
 }
 
-fn photo(folder: &Path, name: &str, side: &str) -> Result<PathBuf> {
+fn photo_path(folder: &Path, name: &str, side: &str) -> Result<PathBuf> {
     ["png", "jpg"]
         .iter()
         .map(|extension| folder.join(format!("{name}{side}.{extension}")))
         .find(|path| path.exists())
-        .with_context(|| format!("no picture {name}{side} in {}", folder.display()))
+        .with_context(|| format!("no photograph {name}{side} in {}", folder.display()))
 }

@@ -1,7 +1,7 @@
-//! The pipelines on real photographs, each figure held against its bar.
+//! The pipelines on real photographs; each figure is compared with its target.
 //!
 //! One file per job. A job is a function from the data folder to its [`Check`]s; register it with one line in `JOBS`.
-//! A figure that is off its bar fails the run; so does an error. Jobs print what else a person wants to see.
+//! A figure that does not meet its target fails the run; so does an error. Jobs print further details.
 
 mod calibration;
 mod calibration_commands;
@@ -19,7 +19,7 @@ pub(crate) use crate::checks::Check;
 use anyhow::Result;
 use std::path::Path;
 
-/// What a job does with the data folder.
+/// A job: from the data folder to its figures.
 type Job = fn(&Path) -> Result<Vec<Check>>;
 
 const JOBS: &[checks::Named<Job>] = &[
@@ -34,10 +34,10 @@ const JOBS: &[checks::Named<Job>] = &[
     ("sfm", sfm::run),
 ];
 
-/// Jobs that take minutes: they run where they are named, or all are.
+/// Jobs that take minutes: they run only by their name or with `all`.
 const LONG: [&str; 1] = ["focal"];
 
-/// Runs all jobs but the long ones, or the one named, or `all`; true where every figure meets its bar.
+/// Runs all jobs but the long ones, or the one named, or `all`; true if every figure meets its target.
 pub(crate) fn run(only: Option<&str>) -> Result<bool> {
     let mut jobs = checks::select(JOBS, only)?;
     jobs.retain(|(name, _)| only.is_some() || !LONG.contains(name));

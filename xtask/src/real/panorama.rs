@@ -1,5 +1,4 @@
-//! Panoramas of real photographs: how many are used, how well the matches agree, how far what two photographs show lies apart at their seams, and
-//! which way is up.
+//! Panoramas of real photographs: number of photographs used, displacement at seams, roll, and coverage of the canvas.
 
 use super::Check;
 use anyhow::{Context, Result};
@@ -7,13 +6,13 @@ use cv_core::{ImageView, Point2, RgbU8, luma_f32};
 use cv_pipeline::{PanoramaOptions, PanoramaPhoto, PanoramaResult, Silent, panorama};
 use std::path::Path;
 
-/// Set, photographs.
+/// Name and number of photographs of each set.
 const SETS: [(&str, usize); 3] = [("weir", 3), ("umd-set1", 3), ("umd-set3", 8)];
 
-/// Half the side of the patches compared across a seam.
-const HALF: i32 = 12;
-/// Farthest displacement looked for.
-const REACH: i32 = 24;
+/// Radius in pixels of the patches compared across a seam.
+const PATCH_RADIUS: i32 = 12;
+/// Largest displacement searched, in pixels.
+const SEARCH_RADIUS: i32 = 24;
 
 pub(super) fn run(data: &Path) -> Result<Vec<Check>> {
     let mut checks = Vec::new();
@@ -24,24 +23,24 @@ pub(super) fn run(data: &Path) -> Result<Vec<Check>> {
             .map(|entry| Ok(entry?.path()))
             .collect::<Result<_>>()?;
         paths.sort();
-        let mut found: Vec<Figures> = Vec::new();
-        // The order of the names must not matter.
-        for turn in [0, count / 2] {
+        let mut figures: Vec<Figures> = Vec::new();
+        // The result must not depend on the order of the files.
+        for shift in [0, count / 2] {
             let mut order = paths.clone();
-            order.rotate_left(turn);
-            found.push(join(set, &order)?);
+            order.rotate_left(shift);
+            figures.push(stitch(set, &order)?);
         }
         let worst = |figure: fn(&Figures) -> f64, worse: fn(f64, f64) -> f64| {
-            found.iter().map(figure).reduce(worse).unwrap_or(f64::NAN)
+            figures.iter().map(figure).reduce(worse).unwrap_or(f64::NAN)
         };
         checks.push(Check::at_least(format!("{set}: photographs used"), worst(|f| f.used, f64::min), count as f64));
         checks.push(Check::at_least(
-            format!("{set}: places on seams with texture to measure"),
-            worst(|f| f.places, f64::min),
+            format!("{set}: textured positions on seams"),
+            worst(|f| f.positions, f64::min),
             20.0,
         ));
         checks.push(Check::at_most(
-            format!("{set}: 95 % displacement at seams, px"),
+            format!("{set}: displacement at seams, 95th percentile, px"),
             worst(|f| f.displacement, f64::max),
             2.0,
         ));
@@ -51,7 +50,7 @@ pub(super) fn run(data: &Path) -> Result<Vec<Check>> {
             10.0,
         ));
         checks.push(Check::at_least(
-            format!("{set}: share of its bounding box covered"),
+            format!("{set}: covered fraction of the canvas"),
             worst(|f| f.covered, f64::min),
             0.6,
         ));
@@ -59,22 +58,22 @@ pub(super) fn run(data: &Path) -> Result<Vec<Check>> {
     Ok(checks)
 }
 
-/// What is measured of one panorama.
+/// Figures of one panorama.
 struct Figures {
     used: f64,
-    places: f64,
+    positions: f64,
     displacement: f64,
     roll: f64,
     covered: f64,
 }
 
-fn join(set: &str, paths: &[std::path::PathBuf]) -> Result<Figures> {
+fn stitch(set: &str, paths: &[std::path::PathBuf]) -> Result<Figures> {
     let photos: Vec<(RgbU8, Option<f64>)> = paths
         .iter()
         .map(|p| {
-            let picture = cv_io::read_image(p)?;
-            let focal = picture.exif.focal.as_ref().map(|f| f.pixels);
-            Ok((picture.into_rgb8(), focal))
+            let file = cv_io::read_image(p)?;
+            let focal = file.exif.focal.as_ref().map(|f| f.pixels);
+            Ok((file.into_rgb8(), focal))
         })
         .collect::<Result<_>>()?;
     let inputs: Vec<PanoramaPhoto<'_>> = photos
@@ -90,7 +89,7 @@ fn join(set: &str, paths: &[std::path::PathBuf]) -> Result<Figures> {
     let (w, h) = result.image.size();
     let times: Vec<String> = result.stages.iter().map(|(s, t)| format!("{s} {:.0} ms", 1000.0 * t)).collect();
     println!(
-        "{set}: {w}x{h} {}, {} places on seams, displacement median {:.2} px, 95 % {:.2} px; {}",
+        "{set}: {w}x{h} {}, {} positions on seams, displacement median {:.2} px, 95th percentile {:.2} px; {}",
         result.canvas.projection,
         seams.len(),
         quantile(0.5),
@@ -99,14 +98,14 @@ fn join(set: &str, paths: &[std::path::PathBuf]) -> Result<Figures> {
     );
     Ok(Figures {
         used: result.images.iter().filter(|i| i.used).count() as f64,
-        places: seams.len() as f64,
+        positions: seams.len() as f64,
         displacement: quantile(0.95),
         roll: largest_roll(&result),
-        covered: covered(&result),
+        covered: covered_fraction(&result),
     })
 }
 
-/// The angle between the canvas's down and each photograph's own, where its middle is drawn.
+/// Returns the largest angle in degrees between the vertical of the canvas and that of a photograph at its center.
 fn largest_roll(result: &PanoramaResult) -> f64 {
     let angles = result.alignment.used().filter_map(|(_, view)| {
         let (w, h) = (view.camera.width as f64, view.camera.height as f64);
@@ -117,17 +116,17 @@ fn largest_roll(result: &PanoramaResult) -> f64 {
     angles.fold(0.0, f64::max)
 }
 
-/// A bow-tied panorama leaves most of its canvas empty.
-fn covered(result: &PanoramaResult) -> f64 {
+/// Returns the covered fraction of the canvas, which is small for a panorama with a bow-tie shape.
+fn covered_fraction(result: &PanoramaResult) -> f64 {
     result.mask.as_slice().iter().filter(|m| **m).count() as f64 / result.mask.as_slice().len() as f64
 }
 
-/// How far apart the two photographs of a seam show the same thing, at places along all seams that have texture in both directions, ascending.
+/// Measures the displacement between the two photographs of each seam at textured positions, in pixels, ascending.
 fn seam_displacements(photos: &[ImageView<'_, u8, 3>], result: &PanoramaResult) -> Vec<f64> {
     let labels = &result.labels;
     let (w, h) = labels.size();
     let mut displacements = Vec::new();
-    // A place every 12 pixels in both directions, where one lies on a seam.
+    // Positions on seams in every 12th row and column.
     for y in (0..h).step_by(12) {
         for x in 1..w {
             let (a, b) = (labels.at(x - 1, y)[0], labels.at(x, y)[0]);
@@ -148,8 +147,8 @@ fn seam_displacements(photos: &[ImageView<'_, u8, 3>], result: &PanoramaResult) 
     displacements
 }
 
-/// The displacement between photographs `a` and `b` around a canvas pixel, by normalized cross-correlation; `None` where there is too little texture, or they
-/// show different things.
+/// Measures the displacement between photographs `a` and `b` around a canvas pixel by normalized cross-correlation; `None` for low texture or
+/// different content.
 fn displacement(
     photos: &[ImageView<'_, u8, 3>],
     result: &PanoramaResult,
@@ -167,9 +166,9 @@ fn displacement(
         }
         Some(values)
     };
-    let (first, second) = (patch(a, HALF)?, patch(b, HALF + REACH)?);
-    let (side, wide) = ((2 * HALF + 1) as usize, (2 * (HALF + REACH) + 1) as usize);
-    // Corner strength: the lesser eigenvalue of the structure tensor, as a gradient in gray levels per pixel.
+    let (first, second) = (patch(a, PATCH_RADIUS)?, patch(b, PATCH_RADIUS + SEARCH_RADIUS)?);
+    let (side, wide) = ((2 * PATCH_RADIUS + 1) as usize, (2 * (PATCH_RADIUS + SEARCH_RADIUS) + 1) as usize);
+    // Corner strength: the smaller eigenvalue of the structure tensor, in squared gray levels per pixel.
     let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
     for r in 1..side - 1 {
         for c in 1..side - 1 {
@@ -181,27 +180,29 @@ fn displacement(
         }
     }
     let n = ((side - 2) * (side - 2)) as f64;
-    let least = (0.5 * (xx + yy) - (0.25 * (xx - yy).powi(2) + xy * xy).sqrt()) / n;
-    if least < 16.0 {
+    let smaller_eigenvalue = (0.5 * (xx + yy) - (0.25 * (xx - yy).powi(2) + xy * xy).sqrt()) / n;
+    if smaller_eigenvalue < 16.0 {
         return None;
     }
-    let reach = REACH as usize;
-    let mut scores = vec![f64::NEG_INFINITY; (2 * reach + 1).pow(2)];
+    let radius = SEARCH_RADIUS as usize;
+    let mut scores = vec![f64::NEG_INFINITY; (2 * radius + 1).pow(2)];
     for (k, score) in scores.iter_mut().enumerate() {
-        let (dy, dx) = (k / (2 * reach + 1), k % (2 * reach + 1));
+        let (dy, dx) = (k / (2 * radius + 1), k % (2 * radius + 1));
         let at = |r: usize, c: usize| second[(r + dy) * wide + c + dx];
         *score = correlation(&first, side, at);
     }
     let (best, score) = scores.iter().copied().enumerate().max_by(|p, q| p.1.total_cmp(&q.1))?;
-    let place = |k: usize| ((k % (2 * reach + 1)) as f64 - reach as f64, (k / (2 * reach + 1)) as f64 - reach as f64);
-    // Below this the two show different things: water, leaves, people. At the end of the reach there is no peak.
-    let (dx, dy) = place(best);
-    if score < 0.85 || dx.abs().max(dy.abs()) >= f64::from(REACH) {
+    let displacement_at =
+        |k: usize| ((k % (2 * radius + 1)) as f64 - radius as f64, (k / (2 * radius + 1)) as f64 - radius as f64);
+    // A low score means different content (water, leaves, people). A maximum at the border of the search window is no peak.
+    let (dx, dy) = displacement_at(best);
+    if score < 0.85 || dx.abs().max(dy.abs()) >= f64::from(SEARCH_RADIUS) {
         return None;
     }
-    // Along an edge many places are as alike but for noise: the nearest of them is what is known of the displacement.
-    let near = (0..scores.len()).filter(|&k| scores[k] >= score - 0.02).map(place).map(|(dx, dy)| dx.hypot(dy));
-    near.min_by(f64::total_cmp)
+    // Aperture problem: along an edge many displacements score alike; the shortest of them is a lower bound.
+    let lengths =
+        (0..scores.len()).filter(|&k| scores[k] >= score - 0.02).map(displacement_at).map(|(dx, dy)| dx.hypot(dy));
+    lengths.min_by(f64::total_cmp)
 }
 
 fn correlation(first: &[f64], side: usize, second: impl Fn(usize, usize) -> f64) -> f64 {

@@ -1,8 +1,8 @@
-//! Many views on rendered photographs, whose poses are known exactly: walks through a room and along streets, each figure against its bar.
+//! Structure from motion on rendered photographs with exact poses: walks through a room and along streets; each figure is compared with its target.
 //!
-//! Photographs have 1200×900 pixels, 67° wide: what a phone's photograph is reduced to before a walk of some hundred is reconstructed, and enough for the bars to be
-//! asked for (a hundredth of a degree is a sixth of a pixel). They are noisy, blurred by the lens and darker in the corners, as the defaults of [`RenderOptions`] say. They are kept below
-//! the folder that the build goes into, by what the renderer makes of a small one, so that a second run does not render them anew.
+//! Photographs have 1200×900 pixels and a field of view of 67°, the size to which a phone's photographs are reduced before a reconstruction of some hundred; 0.01° is
+//! a sixth of a pixel. Noise, blur and vignetting are the defaults of [`RenderOptions`]. They are cached in the target folder under a hash of
+//! two renderings at a small size, so that a change of the renderer invalidates the cache.
 
 mod accuracy;
 
@@ -24,17 +24,17 @@ const JOBS: &[checks::Named<Job>] = &[
     ("street-200", accuracy::street_200),
 ];
 
-/// Jobs that take many minutes where nothing is rendered yet: they run where they are named, or all are.
+/// Jobs that take many minutes without cached photographs: they run only by their name or with `all`.
 const LONG: [&str; 1] = ["street-200"];
 
-/// Runs all jobs but the long ones, or the one named, or `all`; true where every figure meets its bar.
+/// Runs all jobs but the long ones, or the one named, or `all`; true if every figure meets its target.
 pub(crate) fn run(only: Option<&str>) -> Result<bool> {
     let mut jobs = checks::select(JOBS, only)?;
     jobs.retain(|(name, _)| only.is_some() || !LONG.contains(name));
     Ok(checks::run(&jobs, |job| job()))
 }
 
-/// A scene and where it is photographed from.
+/// A scene, the poses of its photographs and their camera.
 struct Walk {
     scene: Scene,
     poses: Vec<Pose>,
@@ -51,8 +51,8 @@ impl Walk {
         Ok(render(&self.scene, camera, &self.poses[index], &options)?.image)
     }
 
-    /// Where its photographs are kept: other pixels of a small one, other folder.
-    fn folder(&self) -> Result<PathBuf> {
+    /// Returns the cache folder of its photographs, named by a hash of two small renderings and the poses.
+    fn cache_folder(&self) -> Result<PathBuf> {
         let mut hasher = DefaultHasher::new();
         for index in [0, self.poses.len() / 2] {
             self.photograph(&self.camera.resized(80, 60), index)?.as_slice().hash(&mut hasher);
@@ -61,24 +61,24 @@ impl Walk {
         Ok(crate::target_dir()?.join("rendered").join(format!("{:016x}", hasher.finish())))
     }
 
-    /// What is found in its photographs.
+    /// Renders its photographs, or reads them from the cache, and extracts their features.
     fn photos(&self, options: &SfmJobOptions) -> Result<Vec<SfmPhoto>> {
-        let folder = self.folder()?;
-        let one = |index: usize| {
+        let folder = self.cache_folder()?;
+        let extract = |index: usize| {
             let name = format!("{index:04}.png");
-            let image = kept(&folder.join(&name), || self.photograph(&self.camera, index))?;
+            let image = read_or_render(&folder.join(&name), || self.photograph(&self.camera, index))?;
             Ok(sfm_photo(image.view(), name, 0, &options.features, &Silent)?)
         };
-        (0..self.poses.len()).map(one).collect()
+        (0..self.poses.len()).map(extract).collect()
     }
 }
 
-/// A picture from its file, or a new one, which is kept there.
-fn kept(path: &Path, make: impl FnOnce() -> Result<RgbU8>) -> Result<RgbU8> {
+/// Reads an image from its file, or renders and writes it.
+fn read_or_render(path: &Path, render: impl FnOnce() -> Result<RgbU8>) -> Result<RgbU8> {
     if path.exists() {
         return Ok(cv_io::read_rgb(path)?);
     }
-    let image = make()?;
+    let image = render()?;
     if let Some(folder) = path.parent() {
         std::fs::create_dir_all(folder)?;
     }

@@ -1,4 +1,4 @@
-//! Which crate may use which, and what every `Cargo.toml` must say.
+//! Rules of the manifests: allowed dependencies between crates, and required entries of every `Cargo.toml`.
 
 use super::{Found, walk};
 use anyhow::{Context, Result};
@@ -6,10 +6,10 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 use std::{collections::BTreeMap, fs, path::Path};
 
-/// The keys of a TOML file.
+/// The top-level keys and values of a TOML file.
 pub(super) type Table = Map<String, Value>;
 
-/// The list in `tiers.toml`.
+/// Contents of `tiers.toml`.
 #[derive(Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) struct Rules {
@@ -23,17 +23,17 @@ pub(super) struct CrateRule {
     uses: Vec<String>,
 }
 
-/// The list itself.
+/// Returns the rules of `tiers.toml`.
 pub(super) fn rules() -> Result<Rules> {
     basic_toml::from_str(include_str!("../tiers.toml")).context("tiers.toml")
 }
 
-/// The keys of a TOML file.
+/// Reads a TOML file.
 pub(super) fn table(path: &Path) -> Result<Table> {
     basic_toml::from_str(&fs::read_to_string(path)?).with_context(|| path.display().to_string())
 }
 
-/// The list itself must obey the tiers.
+/// Checks that the allowed dependencies in `tiers.toml` go to lower tiers.
 pub(super) fn check_tiers(rules: &Rules, found: &mut Found) {
     for (name, rule) in &rules.crates {
         for used in rule.uses.iter().filter(|used| *used != "*") {
@@ -87,7 +87,7 @@ pub(super) fn check_manifest(
             }
             if rules.crates.contains_key(dependency) {
                 let allowed = rule.uses.iter().any(|used| used == dependency || used == "*");
-                // Truth for tests; cv-synth itself uses nothing but cv-core, so no circle arises.
+                // Ground truth for tests; cv-synth itself depends only on cv-core, so there is no cycle.
                 let in_tests = dev && dependency == "cv-synth" && rule.tier >= 1;
                 if !allowed && !in_tests {
                     found
@@ -101,7 +101,7 @@ pub(super) fn check_manifest(
                 found.problems.push(format!("{name} must not use {dependency}: only {} may", only.join(", ")));
             }
             let import = match dependency.as_str() {
-                // Crates whose library has another name than their package.
+                // Packages whose library has another name.
                 "kamadak-exif" => "exif".to_owned(),
                 other => other.replace('-', "_"),
             };
@@ -124,7 +124,7 @@ pub(super) fn check_manifest(
     Ok(())
 }
 
-/// The text of a Rust file, or of all Rust files in a folder; empty where there is none.
+/// Returns the text of a Rust file, or of all Rust files in a folder; empty if there is none.
 fn sources(path: &Path) -> Result<String> {
     let mut files = Vec::new();
     if path.is_dir() {
@@ -139,14 +139,14 @@ fn sources(path: &Path) -> Result<String> {
     Ok(text)
 }
 
-/// Whether the name stands in the text as a path or an attribute, outside line comments that are not doc examples.
+/// Returns whether the text contains the crate's name as the start of a path, in a `use`, or in an attribute.
 fn mentions(text: &str, import: &str) -> bool {
     text.lines().any(|line| {
         line.match_indices(import).any(|(at, _)| {
             let before = line[..at].chars().next_back();
             let after = line[at + import.len()..].trim_start();
-            let whole = !before.is_some_and(|c| c.is_alphanumeric() || c == '_');
-            whole
+            let is_whole_word = !before.is_some_and(|c| c.is_alphanumeric() || c == '_');
+            is_whole_word
                 && (after.starts_with("::")
                     || after.starts_with(';')
                     || after.starts_with("]")
@@ -155,7 +155,7 @@ fn mentions(text: &str, import: &str) -> bool {
     })
 }
 
-/// Files under `src` that no `mod` line names.
+/// Lists the files under `src` without a `mod` line.
 fn orphans(folder: &Path) -> Result<Vec<String>> {
     if !folder.is_dir() {
         return Ok(Vec::new());

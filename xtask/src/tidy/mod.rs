@@ -16,12 +16,12 @@ use std::{
 use text::check_text;
 use type_names::check_type_names;
 
-/// All generated files under `fixtures/` together.
-const FIXTURES_BYTES: u64 = 1 << 20;
+/// Maximum total size of the files under `fixtures/`, in bytes.
+const MAX_FIXTURES_BYTES: u64 = 1 << 20;
 
-/// Prints what is untidy; true where nothing is.
+/// Prints the violations; returns whether there are none.
 pub(crate) fn run() -> Result<bool> {
-    let found = workspace()?;
+    let found = check_workspace()?;
     for note in &found.notes {
         println!("note: {note}");
     }
@@ -39,15 +39,15 @@ struct Found {
     problems: Vec<String>,
 }
 
-/// Every rule, on this workspace.
-fn workspace() -> Result<Found> {
-    let mut found = check(crate::root())?;
+/// Checks every rule on this workspace.
+fn check_workspace() -> Result<Found> {
+    let mut found = check_files(crate::root())?;
     supply::check(crate::root(), &mut found)?;
     Ok(found)
 }
 
-/// The rules that need no more than the files.
-fn check(root: &Path) -> Result<Found> {
+/// Checks the rules that depend on the files alone.
+fn check_files(root: &Path) -> Result<Found> {
     let rules = rules()?;
     let mut found = Found::default();
     let mut files = Vec::new();
@@ -57,17 +57,17 @@ fn check(root: &Path) -> Result<Found> {
 
     check_tiers(&rules, &mut found);
     let mut used = Vec::new();
-    let mut seen = Vec::new();
+    let mut crate_names = Vec::new();
     for manifest in files.iter().filter(|file| file.ends_with("Cargo.toml") && file.parent() != Some(root)) {
         let table = table(manifest)?;
-        // A workspace of its own, as peers/rust, is no crate of this one.
+        // A manifest with its own workspace, such as peers/rust, is not a member of this one.
         if table.contains_key("workspace") {
             continue;
         }
         check_manifest(manifest, &table, &rules, &mut used, &mut found)?;
-        seen.push(name(&table));
+        crate_names.push(name(&table));
     }
-    for missing in rules.crates.keys().filter(|name| !seen.contains(name)) {
+    for missing in rules.crates.keys().filter(|name| !crate_names.contains(name)) {
         found.problems.push(format!("tiers.toml lists {missing}, which is not there"));
     }
     let workspace = table(&root.join("Cargo.toml"))?;
@@ -80,7 +80,7 @@ fn check(root: &Path) -> Result<Found> {
     check_type_names(root, &files, &mut found)?;
     for file in &files {
         let shown = file.strip_prefix(root).unwrap_or(file).display().to_string();
-        // What is not text has no lines to look at.
+        // Binary files are skipped.
         if let Ok(text) = fs::read_to_string(file) {
             check_text(&shown, &text, &mut found);
         }
@@ -88,13 +88,13 @@ fn check(root: &Path) -> Result<Found> {
     let fixtures = root.join("fixtures");
     let size: u64 =
         files.iter().filter(|file| file.starts_with(&fixtures)).flat_map(fs::metadata).map(|data| data.len()).sum();
-    if size > FIXTURES_BYTES {
-        found.problems.push(format!("fixtures/ holds {size} bytes, more than {FIXTURES_BYTES}"));
+    if size > MAX_FIXTURES_BYTES {
+        found.problems.push(format!("fixtures/ has {size} bytes, more than {MAX_FIXTURES_BYTES}"));
     }
     Ok(found)
 }
 
-/// Every file of the project, without build outputs and hidden folders other than `.ci` and `.cargo`.
+/// Lists all files of the project, without build outputs and hidden entries other than `.ci`, `.cargo` and `.gitignore`.
 fn walk(folder: &Path, files: &mut Vec<PathBuf>) -> Result<()> {
     let mut entries: Vec<PathBuf> = fs::read_dir(folder)
         .with_context(|| folder.display().to_string())?
@@ -103,8 +103,8 @@ fn walk(folder: &Path, files: &mut Vec<PathBuf>) -> Result<()> {
     entries.sort();
     for path in entries {
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let kept = [".ci", ".cargo", ".gitignore"].contains(&name.as_str());
-        if name == "target" || (name.starts_with('.') && !kept) {
+        let is_checked = [".ci", ".cargo", ".gitignore"].contains(&name.as_str());
+        if name == "target" || (name.starts_with('.') && !is_checked) {
             continue;
         }
         if path.is_dir() { walk(&path, files)? } else { files.push(path) }
@@ -115,15 +115,15 @@ fn walk(folder: &Path, files: &mut Vec<PathBuf>) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use text::TOO_LONG;
+    use text::MAX_LINES;
 
     #[test]
     fn the_workspace_is_tidy() {
-        let found = workspace().unwrap();
+        let found = check_workspace().unwrap();
         assert!(found.problems.is_empty(), "{:#?}", found.problems);
     }
 
-    /// A workspace with one crate, `cv-stereo`, whose files the test chooses.
+    /// Returns the problems of a workspace with one crate, `cv-stereo`, of the given files.
     fn problems(manifest: &str, files: &[(&str, &str)]) -> Vec<String> {
         let root = tempfile::tempdir().unwrap();
         let folder = root.path().join("crates/cv-stereo");
@@ -135,7 +135,7 @@ mod tests {
         for (name, text) in files {
             fs::write(folder.join(name), text).unwrap();
         }
-        let mut problems = check(root.path()).unwrap().problems;
+        let mut problems = check_files(root.path()).unwrap().problems;
         problems.retain(|problem| !problem.contains("which is not there"));
         problems
     }
@@ -180,11 +180,11 @@ mod tests {
             let found = problems(&manifest, files);
             assert!(found.iter().any(|problem| problem.contains(expected)), "{expected}: {found:?}");
         }
-        let long = LIB.to_owned() + &"\n".repeat(TOO_LONG);
+        let long = LIB.to_owned() + &"\n".repeat(MAX_LINES);
         assert!(problems(GOOD, &[("src/lib.rs", &long)])[0].contains("split it"));
-        let tested = format!("{LIB}#[cfg(test)]\n{}", "\n".repeat(TOO_LONG));
+        let tested = format!("{LIB}#[cfg(test)]\n{}", "\n".repeat(MAX_LINES));
         assert_eq!(problems(GOOD, &[("src/lib.rs", &tested)]), [""; 0]);
-        // What tests do is their business.
+        // The rules do not apply to tests.
         let clock = format!("{LIB}#[cfg(test)]\n{}\n", concat!("Instant::", "now()"));
         assert_eq!(problems(GOOD, &[("src/lib.rs", &clock)]), [""; 0]);
     }

@@ -1,11 +1,11 @@
-//! Libraries do not know the program: no option (`--name`) and no command of it in their string literals.
+//! Libraries are independent of the program: their string literals name none of its options (`--name`) or commands.
 
-/// The lines, from 1, of string literals that name an option or a command of the program. What follows `#[cfg(test)]` is not
-/// looked at: tests may say what they like.
+/// Returns the lines, counted from 1, of string literals that name an option or a command of the program. Text after `#[cfg(test)]`
+/// is not checked.
 pub(super) fn lines(source: &str) -> Vec<usize> {
     let end = source.find("#[cfg(test)]").unwrap_or(source.len());
     let mut found = Vec::new();
-    for (start, literal) in literals(&source[..end]) {
+    for (start, literal) in string_literals(&source[..end]) {
         if names_an_option(literal) || literal.contains("`cv ") {
             found.push(source[..start].matches('\n').count() + 1);
         }
@@ -13,7 +13,7 @@ pub(super) fn lines(source: &str) -> Vec<usize> {
     found
 }
 
-/// Whether `--` and a letter come after a gap; styles of a page have them after a parenthesis, as in `var(--ink)`.
+/// Returns whether the text has `--` and a lowercase letter, except in CSS variables such as `var(--ink)`.
 fn names_an_option(text: &str) -> bool {
     text.match_indices("--").any(|(at, dashes)| {
         let letter = text[at + dashes.len()..].starts_with(|c: char| c.is_ascii_lowercase());
@@ -22,8 +22,8 @@ fn names_an_option(text: &str) -> bool {
     })
 }
 
-/// The string literals of Rust source, plain and raw, with where they start. Comments are skipped.
-fn literals(source: &str) -> Vec<(usize, &str)> {
+/// Returns the string literals of Rust source, plain and raw, with their byte offsets. Comments are skipped.
+fn string_literals(source: &str) -> Vec<(usize, &str)> {
     let mut found = Vec::new();
     let mut at = 0;
     while let Some(rest) = source.get(at..).filter(|rest| !rest.is_empty()) {
@@ -48,7 +48,7 @@ fn literals(source: &str) -> Vec<(usize, &str)> {
             found.push((at, &body[..length]));
             at += length + 2;
         } else if rest.starts_with("'\"'") || rest.starts_with("'\\\"'") {
-            // A quote as a character opens nothing.
+            // A quote in a character literal.
             at += rest[1..].find('\'').map_or(1, |end| end + 2);
         } else {
             at += step;
@@ -70,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn dashes_that_are_no_options_pass() {
+    fn dashes_other_than_options_are_ignored() {
         let source = "let a = \"var(--ink,#222) a -- b ---- --\"; let q = '\"'; let b = '\\\"'; let n = a--b; // \"--x\"\n\
                       let r#type = 1;\n#[cfg(test)]\nlet a = \"--tested\";\n";
         assert_eq!(lines(source), [0; 0]);

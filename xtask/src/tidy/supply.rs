@@ -1,5 +1,5 @@
-//! What comes from others: how many packages, from where, under which license. `deny.toml` holds the lists; `cargo deny`
-//! reads the same ones and adds the advisories, which come from the network.
+//! Third-party packages: number, source and license, against the lists of `deny.toml`; `cargo deny` reads the same lists and also
+//! checks advisories, which requires the network.
 
 use super::Found;
 use super::manifests::table;
@@ -8,15 +8,15 @@ use serde::Deserialize;
 use serde_json::Value;
 use std::{path::Path, process::Command};
 
-/// Packages in `Cargo.lock`: each one is compiled, read and trusted. 12 of them are for Python only, and not part of the program.
-const MOST_PACKAGES: usize = 185;
+/// Maximum number of packages in `Cargo.lock`. 12 of them are for Python only.
+const MAX_PACKAGES: usize = 185;
 
-/// Holds `Cargo.lock`, and the packages that this machine compiles, against `deny.toml`.
+/// Checks `Cargo.lock`, and the packages compiled on this machine, against `deny.toml`.
 pub(super) fn check(root: &Path, found: &mut Found) -> Result<()> {
     let deny = Deny::deserialize(Value::Object(table(&root.join("deny.toml"))?)).context("deny.toml")?;
     let lock = Lock::deserialize(Value::Object(table(&root.join("Cargo.lock"))?)).context("Cargo.lock")?;
     check_lock(&lock, &deny, found);
-    check_licenses(&packages(root)?, &deny, found);
+    check_licenses(&compiled_packages(root)?, &deny, found);
     Ok(())
 }
 
@@ -64,9 +64,9 @@ struct Bans {
 struct Ban {
     #[serde(rename = "crate")]
     name: String,
-    /// Only a second version is refused.
+    /// Whether only a second version is refused.
     #[serde(default, rename = "deny-multiple-versions")]
-    only_twice: bool,
+    allows_one: bool,
 }
 
 #[derive(Deserialize)]
@@ -77,14 +77,14 @@ struct Sources {
 
 fn check_lock(lock: &Lock, deny: &Deny, found: &mut Found) {
     let count = lock.package.len();
-    found.notes.push(format!("Cargo.lock has {count} packages, of at most {MOST_PACKAGES}"));
-    if count > MOST_PACKAGES {
-        found.problems.push(format!("Cargo.lock has {count} packages, more than {MOST_PACKAGES}"));
+    found.notes.push(format!("Cargo.lock has {count} packages, of at most {MAX_PACKAGES}"));
+    if count > MAX_PACKAGES {
+        found.problems.push(format!("Cargo.lock has {count} packages, more than {MAX_PACKAGES}"));
     }
     for ban in &deny.bans.deny {
         let versions: Vec<&str> =
             lock.package.iter().filter(|package| package.name == ban.name).map(|p| p.version.as_str()).collect();
-        if versions.len() > usize::from(ban.only_twice) {
+        if versions.len() > usize::from(ban.allows_one) {
             found.problems.push(format!("Cargo.lock: {} {} is refused by deny.toml", ban.name, versions.join(", ")));
         }
     }
@@ -98,9 +98,14 @@ fn check_lock(lock: &Lock, deny: &Deny, found: &mut Found) {
 
 fn check_licenses(packages: &[Package], deny: &Deny, found: &mut Found) {
     for package in packages {
-        let own = deny.licenses.exceptions.iter().filter(|exception| exception.name == package.name);
-        let allowed: Vec<&str> =
-            deny.licenses.allow.iter().chain(own.flat_map(|own| &own.allow)).map(String::as_str).collect();
+        let exceptions = deny.licenses.exceptions.iter().filter(|exception| exception.name == package.name);
+        let allowed: Vec<&str> = deny
+            .licenses
+            .allow
+            .iter()
+            .chain(exceptions.flat_map(|exception| &exception.allow))
+            .map(String::as_str)
+            .collect();
         let license = package.license.as_deref().unwrap_or("none");
         if !permits(license, &allowed) {
             found.problems.push(format!("{} {}: its license is {license}", package.name, package.version));
@@ -108,8 +113,8 @@ fn check_licenses(packages: &[Package], deny: &Deny, found: &mut Found) {
     }
 }
 
-/// The packages of `Cargo.lock` that this machine compiles.
-fn packages(root: &Path) -> Result<Vec<Package>> {
+/// Returns the packages of `Cargo.lock` that are compiled on this machine.
+fn compiled_packages(root: &Path) -> Result<Vec<Package>> {
     #[derive(Deserialize)]
     struct Metadata {
         packages: Vec<Package>,
@@ -127,38 +132,39 @@ fn packages(root: &Path) -> Result<Vec<Package>> {
     Ok(metadata.packages)
 }
 
-/// Whether an SPDX expression can be met by allowed licenses.
+/// Returns whether an SPDX expression is satisfied by the allowed licenses.
 fn permits(expression: &str, allowed: &[&str]) -> bool {
-    // An old way to write OR.
+    // The deprecated separator of alternatives.
     let spaced = expression.replace('/', " OR ").replace('(', " ( ").replace(')', " ) ");
     let words: Vec<&str> = spaced.split_whitespace().collect();
-    let (met, rest) = either(&words, allowed);
+    let (met, rest) = parse_or(&words, allowed);
     met && rest.is_empty()
 }
 
-/// Alternatives, and the words behind them.
-fn either<'a, 'b>(words: &'a [&'b str], allowed: &[&str]) -> (bool, &'a [&'b str]) {
-    let (mut met, mut rest) = all(words, allowed);
+/// Parses an expression with OR; returns whether it is satisfied and the remaining words.
+fn parse_or<'a, 'b>(words: &'a [&'b str], allowed: &[&str]) -> (bool, &'a [&'b str]) {
+    let (mut met, mut rest) = parse_and(words, allowed);
     while let ["OR", after @ ..] = rest {
-        let (other, after) = all(after, allowed);
+        let (other, after) = parse_and(after, allowed);
         (met, rest) = (met | other, after);
     }
     (met, rest)
 }
 
-/// Licenses that hold together, and the words behind them.
-fn all<'a, 'b>(words: &'a [&'b str], allowed: &[&str]) -> (bool, &'a [&'b str]) {
-    let (mut met, mut rest) = one(words, allowed);
+/// Parses an expression with AND; returns whether it is satisfied and the remaining words.
+fn parse_and<'a, 'b>(words: &'a [&'b str], allowed: &[&str]) -> (bool, &'a [&'b str]) {
+    let (mut met, mut rest) = parse_term(words, allowed);
     while let ["AND", after @ ..] = rest {
-        let (other, after) = one(after, allowed);
+        let (other, after) = parse_term(after, allowed);
         (met, rest) = (met & other, after);
     }
     (met, rest)
 }
 
-fn one<'a, 'b>(words: &'a [&'b str], allowed: &[&str]) -> (bool, &'a [&'b str]) {
+/// Parses a license, a license with an exception, or an expression in parentheses.
+fn parse_term<'a, 'b>(words: &'a [&'b str], allowed: &[&str]) -> (bool, &'a [&'b str]) {
     match words {
-        ["(", inner @ ..] => match either(inner, allowed) {
+        ["(", inner @ ..] => match parse_or(inner, allowed) {
             (met, [")", rest @ ..]) => (met, rest),
             (_, rest) => (false, rest),
         },
@@ -175,7 +181,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn license_expressions_are_read() {
+    fn license_expressions_are_evaluated() {
         let allowed = ["MIT", "Zlib", "Apache-2.0 WITH LLVM-exception"];
         for good in
             ["MIT", "GPL-3.0 OR MIT", "MIT/Apache-2.0", "(MIT OR GPL-3.0) AND Zlib", "Apache-2.0 WITH LLVM-exception"]
@@ -210,7 +216,7 @@ mod tests {
         assert_eq!(locked(&["a", "once"]), [""; 0]);
         assert!(locked(&["cc"])[0].contains("refused"));
         assert!(locked(&["once", "once"])[0].contains("refused"));
-        assert!(locked(&["a"; MOST_PACKAGES + 1])[0].contains("more than"));
+        assert!(locked(&["a"; MAX_PACKAGES + 1])[0].contains("more than"));
         let mut found = Found::default();
         check_lock(&Lock { package: vec![package("a", Some("git+https://crates"), None)] }, &deny, &mut found);
         assert!(found.problems[0].contains("comes from"));

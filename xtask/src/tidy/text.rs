@@ -1,15 +1,15 @@
-//! Rules that look at the lines of a file.
+//! Rules that check the lines of a file.
 
 use super::Found;
 
-/// Lines of a source file before its tests: above the first number it is mentioned, above the second it fails.
-const LONG: usize = 500;
-pub(super) const TOO_LONG: usize = 600;
+/// Lines of a source file before its tests above which a note is printed.
+const NOTE_LINES: usize = 500;
+/// Lines of a source file before its tests above which the check fails.
+pub(super) const MAX_LINES: usize = 600;
 
-/// What a library crate must not do: in a browser there is no clock, no file and no second thread, and it panics or does
-/// not build. The second entry says where it may be done after all. Written in two halves, so that this file does not find
-/// itself.
-const NOT_IN_LIBRARIES: [([&str; 2], &[&str], &str); 6] = [
+/// Calls that a library crate must not make: clocks, files, threads and processes panic or do not compile in a browser. The second
+/// entry lists exceptions. The names are written in two halves, so that this file does not match itself.
+const FORBIDDEN_IN_LIBRARIES: [([&str; 2], &[&str], &str); 6] = [
     (["Instant::", "now"], &["crates/cv-core/src/stage_clock.rs"], "reads a clock: use cv_core::StageClock"),
     (["System", "Time"], &["crates/cv-io/"], "reads a clock: use cv_core::StageClock"),
     (["std::", "fs"], &["crates/cv-io/"], "opens files: cv-io does that"),
@@ -22,11 +22,13 @@ pub(super) fn check_text(shown: &str, text: &str, found: &mut Found) {
     let rust = shown.ends_with(".rs");
     if rust {
         let lines = text.lines().take_while(|line| line.trim() != "#[cfg(test)]").count();
-        // Files of tests only are as long as they need to be.
+        // The length of test files is not limited.
         if !shown.contains("/tests/") && !shown.ends_with("tests.rs") {
-            if lines > TOO_LONG {
-                found.problems.push(format!("{shown}: {lines} lines before its tests, more than {TOO_LONG}: split it"));
-            } else if lines > LONG {
+            if lines > MAX_LINES {
+                found
+                    .problems
+                    .push(format!("{shown}: {lines} lines before its tests, more than {MAX_LINES}: split it"));
+            } else if lines > NOTE_LINES {
                 found.notes.push(format!("{shown}: {lines} lines before its tests"));
             }
         }
@@ -41,14 +43,14 @@ pub(super) fn check_text(shown: &str, text: &str, found: &mut Found) {
     }
     if rust && library && !shown.ends_with("tests.rs") {
         for (number, line) in text.lines().enumerate().take_while(|(_, line)| line.trim() != "#[cfg(test)]") {
-            for (halves, places, what) in &NOT_IN_LIBRARIES {
+            for (halves, places, what) in &FORBIDDEN_IN_LIBRARIES {
                 if line.contains(&halves.concat()) && !places.iter().any(|place| shown.starts_with(place)) {
                     found.problems.push(format!("{shown}:{}: {what}", number + 1));
                 }
             }
         }
     }
-    // Written in two halves, so that this file does not find itself.
+    // Written in two halves, so that this file does not match itself.
     let unfinished =
         [["TO", "DO"], ["FIX", "ME"], ["to", "do!("], ["unimple", "mented!("]].map(|halves| halves.concat());
     let paths =

@@ -8,7 +8,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// No two public types of the crates have one name: a reader who knows the name knows the type.
+/// Checks that the names of public types are unique over all crates.
 pub(super) fn check_type_names(root: &Path, files: &[PathBuf], found: &mut Found) -> Result<()> {
     let mut types: BTreeMap<String, Vec<String>> = BTreeMap::new();
     let crates = root.join("crates");

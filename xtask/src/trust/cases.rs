@@ -1,4 +1,4 @@
-//! Commands on small inputs: every command, every kind of file that it reads.
+//! Commands on small inputs: every command with every kind of input file.
 
 use anyhow::{Context, Result};
 use cv_core::{Camera, Distortion, DistortionModel, GrayF32, Image, Mask, Pose, RgbU8, Rotation3, StereoRig, Vector3};
@@ -13,11 +13,11 @@ use std::{
 
 /// A command.
 pub(crate) struct Case {
-    /// For people.
+    /// Name in messages.
     pub(crate) name: &'static str,
-    /// Its arguments; inputs are in `in/`, outputs in `out/`.
+    /// Arguments; inputs are in `in/`, outputs in `out/`.
     pub(crate) args: &'static str,
-    /// The files in `in/` that it reads.
+    /// Files in `in/` that are damaged.
     pub(crate) inputs: &'static [&'static str],
 }
 
@@ -26,7 +26,7 @@ impl Case {
         self.args.split_whitespace()
     }
 
-    /// The outputs that are single files.
+    /// Returns the outputs that are single files.
     pub(crate) fn files(&self) -> impl Iterator<Item = &'static str> {
         self.args().filter(|word| word.starts_with("out/") && Path::new(word).extension().is_some())
     }
@@ -36,7 +36,7 @@ const fn case(name: &'static str, args: &'static str, inputs: &'static [&'static
     Case { name, args, inputs }
 }
 
-/// All of them. A word that begins with `out/` and has an ending is a file that the command writes.
+/// All cases. An argument that begins with `out/` and has an extension is an output file.
 pub(crate) const CASES: &[Case] = &[
     case(
         "depth",
@@ -145,7 +145,7 @@ pub(crate) const CASES: &[Case] = &[
     case("HDR", "segment predict --model in/model.json in/seed.hdr -o out/found", &["seed.hdr"]),
 ];
 
-/// A folder `in` with what the commands read, and an empty folder `out`. Photographs come from the real data where there are, else from `fixtures/`.
+/// Creates a folder `in` with the commands' inputs and an empty folder `out`. Photographs are from the real data if it exists, else from `fixtures/`.
 pub(crate) fn prepare(folder: &Path, program: &Path) -> Result<()> {
     for name in ["in/masks", "in/arrays", "in/texts", "out"] {
         fs::create_dir_all(folder.join(name))?;
@@ -160,8 +160,8 @@ pub(crate) fn prepare(folder: &Path, program: &Path) -> Result<()> {
             .unwrap_or_else(|| crate::root().join("fixtures").join(of_fixtures))
     };
 
-    let (left, _) = reduced(&pick("stereo/cones/im2.png", "stereo/left.jpg"), 150)?;
-    let (right, _) = reduced(&pick("stereo/cones/im6.png", "stereo/right.jpg"), 150)?;
+    let (left, _) = read_reduced(&pick("stereo/cones/im2.png", "stereo/left.jpg"), 150)?;
+    let (right, _) = read_reduced(&pick("stereo/cones/im6.png", "stereo/right.jpg"), 150)?;
     cv_io::write_jpeg(to.join("left.jpg"), left.view())?;
     cv_io::write_png(to.join("right.png"), right.view())?;
     let deep: Image<u16, 3> = left.map(|p| p.map(|v| u16::from(v) * 257));
@@ -176,21 +176,21 @@ pub(crate) fn prepare(folder: &Path, program: &Path) -> Result<()> {
     for (name, of_data, of_fixtures, width) in [
         ("a", "sfm/sceaux/100_7101.JPG", "two-view/a.jpg", 480),
         ("b", "sfm/sceaux/100_7102.JPG", "two-view/b.jpg", 480),
-        // Farther from the first: two alone make a model.
+        // A larger baseline, so that two photographs suffice for a model.
         ("c", "sfm/sceaux/100_7103.JPG", "two-view/b.jpg", 480),
         ("1", "panorama/weir/weir_1.jpg", "panorama/view0.jpg", 240),
         ("2", "panorama/weir/weir_2.jpg", "panorama/view1.jpg", 240),
         ("ball1", "segmentation/orange-ball/train/106.jpg", "ball/ball1.jpg", 120),
         ("ball2", "segmentation/orange-ball/train/121.jpg", "ball/ball2.jpg", 120),
     ] {
-        let (photo, metadata) = reduced(&pick(of_data, of_fixtures), width)?;
+        let (photo, metadata) = read_reduced(&pick(of_data, of_fixtures), width)?;
         cv_io::write_image(to.join(format!("{name}.jpg")), photo.view(), &metadata)?;
     }
     for (name, of_data, of_fixtures) in [
         ("ball1", "segmentation/orange-ball/train/106_mask.png", "oracle/ball-masks/ball1_mask.png"),
         ("ball2", "segmentation/orange-ball/train/121_mask.png", "oracle/ball-masks/ball2_mask.png"),
     ] {
-        let (mask, _) = reduced(&pick(of_data, of_fixtures), 120)?;
+        let (mask, _) = read_reduced(&pick(of_data, of_fixtures), 120)?;
         let mask: Mask = mask.map(|[r, _, _]| [r > 127]);
         cv_io::write_png(to.join(format!("masks/{name}.png")), mask.view())?;
     }
@@ -204,10 +204,10 @@ pub(crate) fn prepare(folder: &Path, program: &Path) -> Result<()> {
         fs::copy(crate::root().join(format!("fuzz/seeds/{format}/0")), to.join(format!("seed.{format}")))?;
     }
 
-    // What commands read that commands have written.
+    // Inputs that are outputs of other commands.
     let run = |args: &str| -> Result<()> {
-        let ran = Command::new(program).current_dir(folder).args(args.split_whitespace()).output()?;
-        anyhow::ensure!(ran.status.success(), "cv {args}: {}", String::from_utf8_lossy(&ran.stderr));
+        let output = Command::new(program).current_dir(folder).args(args.split_whitespace()).output()?;
+        anyhow::ensure!(output.status.success(), "cv {args}: {}", String::from_utf8_lossy(&output.stderr));
         Ok(())
     };
     run("match in/a.jpg in/b.jpg -o in/m.txt --save-features in/arrays")?;
@@ -220,8 +220,8 @@ pub(crate) fn prepare(folder: &Path, program: &Path) -> Result<()> {
     )
 }
 
-/// A photograph of this width, with what its camera said.
-fn reduced(path: &Path, width: usize) -> Result<(RgbU8, Metadata)> {
+/// Reads a photograph, reduced to a width, with its metadata.
+fn read_reduced(path: &Path, width: usize) -> Result<(RgbU8, Metadata)> {
     let photo = cv_io::read_image(path).with_context(|| path.display().to_string())?;
     let metadata = photo.metadata.clone();
     let photo = photo.into_rgb8();
@@ -250,7 +250,7 @@ fn rigs(to: &Path, (w, h): (usize, usize)) -> Result<()> {
     Ok(fs::write(to.join("three.yaml"), format("own")?.array_text(&file, &[])?)?)
 }
 
-/// Photographs of a chessboard of 8 by 6 squares by one camera.
+/// Renders photographs of a chessboard of 8 × 6 squares by one camera.
 fn boards(to: &Path) -> Result<()> {
     let sheet = Sheet {
         texture: Texture::Board { squares: (8, 6), square: 0.03 },
@@ -263,8 +263,8 @@ fn boards(to: &Path) -> Result<()> {
     let camera = Camera::from_focal(320, 240, 280.0);
     for i in 1..=4 {
         let angle = 1.6 * f64::from(i);
-        let turn = Rotation3::new(Vector3::new(0.5 * angle.sin(), 0.5 * angle.cos(), 0.1));
-        let pose = Pose::new(turn, Vector3::new(0.0, 0.0, 0.36) - turn * Vector3::new(0.135, 0.105, 0.0));
+        let rotation = Rotation3::new(Vector3::new(0.5 * angle.sin(), 0.5 * angle.cos(), 0.1));
+        let pose = Pose::new(rotation, Vector3::new(0.0, 0.0, 0.36) - rotation * Vector3::new(0.135, 0.105, 0.0));
         let photo = sheet.photo(&camera, &pose, &RenderOptions::default())?;
         cv_io::write_png(to.join(format!("board{i}.png")), photo.view())?;
     }
@@ -277,7 +277,7 @@ fn cameras(to: &Path, folder: &Path) -> Result<()> {
     for (name, of) in [("cam.yaml", "own"), ("cameras.txt", "colmap")] {
         fs::write(to.join(name), format(of)?.camera_text(&camera, &[])?)?;
     }
-    // ROS's is read only.
+    // The ROS format, which the program cannot write.
     let (w, h, f) = (camera.width, camera.height, camera.fx);
     let matrix = format!("camera_matrix:\n  rows: 3\n  cols: 3\n  data: [{f}, 0, 240, 0, {f}, 180, 0, 0, 1]\n");
     let lens = "distortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [-0.01, 0.002, 0, 0, 0]\n";
@@ -299,7 +299,7 @@ fn maps(to: &Path) -> Result<()> {
     Ok(cv_io::write_png(to.join("seen.png"), Mask::from_fn(60, 44, |x, _| [x > 9]).view())?)
 }
 
-/// Names and bytes of all files below a folder, sorted.
+/// Returns paths and bytes of all files below a folder, sorted.
 pub(crate) fn snapshot(folder: &Path) -> Result<Vec<(PathBuf, Vec<u8>)>> {
     let mut files = Vec::new();
     for entry in fs::read_dir(folder).with_context(|| folder.display().to_string())? {
@@ -315,32 +315,32 @@ pub(crate) fn snapshot(folder: &Path) -> Result<Vec<(PathBuf, Vec<u8>)>> {
     Ok(files)
 }
 
-/// Whether it is what a command writes before it gets its name, or in a folder of such.
+/// Returns whether a path is a temporary file of the program, or in a temporary folder.
 pub(crate) fn is_temporary(path: &Path) -> bool {
     path.components().any(|part| part.as_os_str().to_string_lossy().starts_with(".cv-"))
 }
 
-/// What is wrong with a file that a command has written.
-pub(crate) fn fault(path: &Path, bytes: &[u8]) -> Option<String> {
+/// Checks that a file written by a command is complete; returns the problem if it is not.
+pub(crate) fn find_problem(path: &Path, bytes: &[u8]) -> Option<String> {
     let shown = path.display();
     if is_temporary(path) {
         return Some(format!("{shown} was left behind"));
     }
-    let whole = match path.extension().and_then(|ending| ending.to_str()) {
+    let is_complete = match path.extension().and_then(|extension| extension.to_str()) {
         Some("png" | "jpg") => cv_io::decode_image(bytes, &cv_io::ReadOptions::default()).is_ok(),
         Some("pfm") => pfm::decode(bytes).is_ok(),
         Some("npy") => npy::decode(bytes).is_ok(),
         Some("pdf") => bytes.trim_ascii_end().ends_with(b"%%EOF"),
         Some("json") => serde_json::from_slice::<serde_json::Value>(bytes).is_ok(),
         Some("html") => bytes.trim_ascii_end().ends_with(b"</html>"),
-        Some("ply") => ply_is_whole(bytes),
+        Some("ply") => is_complete_ply(bytes),
         _ => bytes.ends_with(b"\n"),
     };
-    (!whole).then(|| format!("{shown}, {} bytes, is not whole", bytes.len()))
+    (!is_complete).then(|| format!("{shown}, {} bytes, is not complete", bytes.len()))
 }
 
-/// Whether as many bytes follow as the header of a binary PLY file says.
-fn ply_is_whole(bytes: &[u8]) -> bool {
+/// Returns whether a binary PLY file has as many bytes as its header requires.
+fn is_complete_ply(bytes: &[u8]) -> bool {
     let end = b"end_header\n";
     let Some(start) = bytes.windows(end.len()).position(|window| window == end) else { return false };
     let header = String::from_utf8_lossy(&bytes[..start]);

@@ -1,4 +1,4 @@
-//! Runs that are killed at random moments: what was there before stays whole, and the next run leaves nothing stray behind.
+//! Kills runs at random times: existing outputs stay complete, and the next run removes all temporary files.
 
 use super::{Options, cases, program};
 use anyhow::{Result, ensure};
@@ -26,52 +26,52 @@ pub(super) fn run(options: &Options) -> Result<bool> {
         command.current_dir(folder.path()).args(case.args()).stdout(Stdio::null()).stderr(Stdio::null());
         command
     };
-    let (mut finds, mut alive, mut left) = (0, 0, 0);
+    let (mut failures, mut running, mut temporary) = (0, 0, 0);
     for (i, case) in writing.iter().enumerate() {
         let kills = count / writing.len() as u64 + u64::from((i as u64) < count % writing.len() as u64);
         let start = Instant::now();
         ensure!(command(case).status()?.success(), "{} fails", case.name);
-        let whole = start.elapsed();
-        let new = cases::snapshot(&out)?;
+        let duration = start.elapsed();
+        let new_files = cases::snapshot(&out)?;
         for _ in 0..kills {
             for file in case.files() {
                 fs::write(folder.path().join(file), "old\n")?;
             }
             let mut child = command(case).spawn()?;
-            // As likely near the end, where files are written, as anywhere.
-            let share = f64::from(rng.next_u32()) / f64::from(u32::MAX);
-            let share = if rng.next_u32().is_multiple_of(2) { share } else { 1.0 - 0.2 * share };
-            sleep(whole.mul_f64(share));
-            // It may have ended by itself.
+            // Half of the kills are in the last fifth of the duration, where files are written.
+            let fraction = f64::from(rng.next_u32()) / f64::from(u32::MAX);
+            let fraction = if rng.next_u32().is_multiple_of(2) { fraction } else { 1.0 - 0.2 * fraction };
+            sleep(duration.mul_f64(fraction));
+            // The run may have ended before.
             let _ = child.kill();
-            alive += u64::from(child.wait()?.code().is_none());
+            running += u64::from(child.wait()?.code().is_none());
             for (path, bytes) in cases::snapshot(&out)? {
                 if cases::is_temporary(&path) {
-                    left += 1;
+                    temporary += 1;
                     continue;
                 }
-                let html = path.extension().is_some_and(|ending| ending == "html");
-                let known = new.iter().any(|(other, new)| *other == path && (*new == bytes || html));
-                if let Some(what) =
-                    (bytes != b"old\n" && !known).then(|| format!("{} is neither old nor new", path.display()))
+                let is_html = path.extension().is_some_and(|extension| extension == "html");
+                let is_complete = new_files.iter().any(|(other, new)| *other == path && (*new == bytes || is_html));
+                if let Some(problem) = (bytes != b"old\n" && !is_complete)
+                    .then(|| format!("{} is neither the old nor the new file", path.display()))
                 {
-                    finds += 1;
-                    println!("FOUND: {}: {what}", case.name);
+                    failures += 1;
+                    println!("FAILURE: {}: {problem}", case.name);
                 }
             }
         }
         ensure!(command(case).status()?.success(), "{} fails", case.name);
         for (path, bytes) in cases::snapshot(&out)? {
-            if let Some(what) = cases::fault(&path, &bytes) {
-                finds += 1;
-                println!("FOUND: {}, after the run that followed: {what}", case.name);
+            if let Some(problem) = cases::find_problem(&path, &bytes) {
+                failures += 1;
+                println!("FAILURE: {}, after the next run: {problem}", case.name);
             }
         }
         fs::remove_dir_all(&out)?;
         fs::create_dir(&out)?;
     }
     println!(
-        "{count} kills, {alive} while the run was at work; {left} temporary files were left and swept up by the next run; {finds} finds"
+        "{count} kills, {running} during a run; {temporary} temporary files were left and removed by the next run; {failures} failures"
     );
-    Ok(finds == 0)
+    Ok(failures == 0)
 }

@@ -1,4 +1,4 @@
-//! What the program does under bad circumstances: damaged inputs, sudden death, other processors. See docs/trust.md.
+//! Robustness of the program: damaged inputs, kills at random times, other processors and thread counts. See docs/trust.md.
 //!
 //! One file per job, over the commands of `cases`.
 
@@ -11,11 +11,11 @@ use crate::checks;
 use anyhow::{Result, ensure};
 use std::path::PathBuf;
 
-/// What a job is given.
+/// Options of the jobs.
 pub(crate) struct Options {
-    /// Runs of `corrupt` and `killed`.
+    /// Number of runs of `corrupt` and `killed`.
     pub(crate) count: Option<u64>,
-    /// Of the random choices.
+    /// Seed of the random choices.
     pub(crate) seed: u64,
 }
 
@@ -23,7 +23,7 @@ type Job = fn(&Options) -> Result<bool>;
 
 const JOBS: &[checks::Named<Job>] = &[("bytes", bytes::run), ("corrupt", corrupt::run), ("killed", killed::run)];
 
-/// Runs all jobs, or the one named; true where nothing was found.
+/// Runs all jobs, or the one named; returns whether there were no failures.
 pub(crate) fn run(only: Option<&str>, options: &Options) -> Result<bool> {
     let mut good = true;
     for (name, job) in checks::select(JOBS, only)? {
@@ -33,12 +33,12 @@ pub(crate) fn run(only: Option<&str>, options: &Options) -> Result<bool> {
     Ok(good)
 }
 
-/// The program that was built with this one.
+/// Returns the path of the program built with the same profile as this one.
 pub(crate) fn program() -> Result<PathBuf> {
     let path = std::env::current_exe()?.with_file_name("cv");
     ensure!(
         path.is_file(),
-        "{} is not there; try: cargo build --locked --bin cv, in the profile of xtask",
+        "{} does not exist; run: cargo build --locked --bin cv, in the profile of xtask",
         path.display()
     );
     Ok(path)

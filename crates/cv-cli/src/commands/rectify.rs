@@ -118,8 +118,8 @@ impl Run for Args {
             q.row_iter().map(|row| row.iter().map(f64::to_string).collect::<Vec<_>>().join(" ")).collect();
         context.write(Output::Folder(&self.output), |out| {
             cv_io::write_together(out, &NAMES, |folder| {
-                write_picture(&folder.join("left.png"), &result.images[0], &photos.left.metadata)?;
-                write_picture(&folder.join("right.png"), &result.images[1], &photos.right.metadata)?;
+                write_image(&folder.join("left.png"), &result.images[0], &photos.left.metadata)?;
+                write_image(&folder.join("right.png"), &result.images[1], &photos.right.metadata)?;
                 cv_io::write_rig(folder.join("rig.yaml"), &RigFile { rig: rectified, unit }, &["rectified"])?;
                 cv_io::write_bytes(folder.join("q.txt"), format!("{}\n", rows.join("\n")).as_bytes())
             })
@@ -183,12 +183,12 @@ impl Run for Args {
 }
 
 /// Writes an image at its bit depth, with the metadata of the original file.
-pub(super) fn write_picture(path: &Path, picture: &DynImage, metadata: &Metadata) -> Result<(), IoError> {
-    match &picture.pixels {
+pub(super) fn write_image(path: &Path, file: &DynImage, metadata: &Metadata) -> Result<(), IoError> {
+    match &file.pixels {
         Pixels::Gray8(image) => cv_io::write_image(path, image.view(), metadata),
         Pixels::Gray16(image) => cv_io::write_image(path, image.view(), metadata),
         Pixels::Rgb16(image) => cv_io::write_image(path, image.view(), metadata),
-        _ => cv_io::write_image(path, picture.clone().into_rgb8().view(), metadata),
+        _ => cv_io::write_image(path, file.clone().into_rgb8().view(), metadata),
     }
 }
 

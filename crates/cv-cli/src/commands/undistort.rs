@@ -1,6 +1,6 @@
 //! `cv undistort`: correction of lens distortion.
 
-use super::rectify::{parse_fraction, write_picture};
+use super::rectify::{parse_fraction, write_image};
 use super::size;
 use crate::frame::{Context, Explain, Failure, Global, Outcome, Output, Run, expand_images, one_each, spare_inputs};
 use crate::rig;
@@ -88,7 +88,7 @@ impl Run for Args {
             let pixels = undistorted_pixels(&photo.pixels, map)?;
             seconds += start.elapsed().as_secs_f64();
             let straight = DynImage { pixels, exif: ExifInfo::default(), metadata: Metadata::default() };
-            context.write(Output::Folder(&self.output), |_| write_picture(result, &straight, &photo.metadata))?;
+            context.write(Output::Folder(&self.output), |_| write_image(result, &straight, &photo.metadata))?;
             done.push(json!({ "path": path.display().to_string(), "output": result.display().to_string() }));
             stage.add(1)?;
         }

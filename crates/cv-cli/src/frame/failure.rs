@@ -105,11 +105,8 @@ mod tests {
 
     #[test]
     fn the_hint_of_a_file_error_is_the_advice() {
-        let failure: Failure = cv_io::read_rgb("no/such/picture.png").unwrap_err().into();
+        let failure: Failure = cv_io::read_rgb("no/such/photo.png").unwrap_err().into();
         let text = failure.text();
-        assert!(
-            text.starts_with("error: cannot read no/such/picture.png: ") && text.contains("; try: check"),
-            "{text}"
-        );
+        assert!(text.starts_with("error: cannot read no/such/photo.png: ") && text.contains("; try: check"), "{text}");
     }
 }

@@ -22,7 +22,7 @@ pub(crate) use failure::{Explain, Failure};
 pub(crate) use inputs::{expand_images, sort_by_name, stands_for_many, two_images};
 pub(crate) use named::named;
 pub(crate) use outcome::Outcome;
-pub(crate) use outputs::{CLOUD, JSON, MAP, Output, PICTURE, PNG, TEXT, YAML, one_each, same_file, spare_inputs};
+pub(crate) use outputs::{CLOUD, IMAGE, JSON, MAP, Output, PNG, TEXT, YAML, one_each, same_file, spare_inputs};
 pub(crate) use progress::Step;
 
 use clap::{Args, value_parser};

@@ -11,7 +11,7 @@ use std::{
 };
 
 /// Extensions of images for people.
-pub(crate) const PICTURE: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff"];
+pub(crate) const IMAGE: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff"];
 /// Extension of images that must be lossless.
 pub(crate) const PNG: &[&str] = &["png"];
 /// Extensions of float maps.

@@ -136,8 +136,8 @@ pub(crate) fn note(note: &CaptureNote, names: &[impl AsRef<str>]) -> String {
             "{}the RMS error on held-out photographs is {holdout_rms_px:.2} px, on the fitted ones {rms_px:.2} px; take more photographs, with a rigid board",
             name(camera)
         ),
-        CaptureNote::LeftOut { camera, pictures, of } => {
-            format!("{}{pictures} of {of} photographs with a board are left out", name(camera))
+        CaptureNote::LeftOut { camera, images, of } => {
+            format!("{}{images} of {of} photographs with a board are left out", name(camera))
         }
         CaptureNote::FewShared { camera, got, wanted } => {
             format!(

@@ -1,4 +1,4 @@
-//! What the black-box tests share: running the program and making files, good and bad.
+//! Common parts of the black-box tests: running the program, and writing valid and broken files.
 
 #![allow(dead_code, reason = "each test file uses its part")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
@@ -10,14 +10,14 @@ use std::{
     process::{Command, Output, Stdio},
 };
 
-/// The program, ready for arguments, in a folder.
+/// Returns the program's command in a folder, without arguments.
 pub(crate) fn cv(folder: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_cv"));
     command.current_dir(folder).stdin(Stdio::null());
     command
 }
 
-/// How a run ended.
+/// Result of a run.
 #[derive(Debug)]
 pub(crate) struct Ran {
     pub(crate) code: Option<i32>,
@@ -25,7 +25,7 @@ pub(crate) struct Ran {
     pub(crate) stderr: String,
 }
 
-/// Runs the program with arguments in a folder. Whatever it is given, it must not die of a bug.
+/// Runs the program with arguments in a folder; asserts that it does not panic.
 pub(crate) fn run(folder: &Path, args: &[&str]) -> Ran {
     let Output { status, stdout, stderr } = cv(folder).args(args).output().unwrap();
     let ran = Ran {
@@ -38,14 +38,14 @@ pub(crate) fn run(folder: &Path, args: &[&str]) -> Ran {
     ran
 }
 
-/// A run that must succeed.
+/// Runs the program; asserts that it succeeds.
 pub(crate) fn done(folder: &Path, args: &[&str]) -> Ran {
     let ran = run(folder, args);
     assert_eq!(ran.code, Some(0), "cv {args:?}: {ran:?}");
     ran
 }
 
-/// A run that must fail with exit code 1 and one line that says why.
+/// Runs the program; asserts that it fails with exit code 1 and one line of error.
 pub(crate) fn refused(folder: &Path, args: &[&str]) -> Ran {
     let ran = run(folder, args);
     assert_eq!(ran.code, Some(1), "cv {args:?}: {ran:?}");
@@ -55,7 +55,7 @@ pub(crate) fn refused(folder: &Path, args: &[&str]) -> Ran {
     ran
 }
 
-/// A run that must succeed and print exactly one JSON object, with the keys every command has.
+/// Runs the program; asserts that it succeeds and prints one JSON object with the common keys.
 pub(crate) fn json(folder: &Path, args: &[&str]) -> serde_json::Value {
     let ran = done(folder, &[args, &["--json"]].concat());
     let value: serde_json::Value = serde_json::from_str(&ran.stdout).unwrap_or_else(|e| panic!("{e}: {ran:?}"));
@@ -65,7 +65,7 @@ pub(crate) fn json(folder: &Path, args: &[&str]) -> serde_json::Value {
     value
 }
 
-/// Names and bytes of all files below a folder, sorted.
+/// Returns paths and bytes of all files below a folder, sorted.
 pub(crate) fn snapshot(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     let mut files = Vec::new();
     for entry in fs::read_dir(folder).unwrap() {
@@ -80,11 +80,11 @@ pub(crate) fn snapshot(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     files
 }
 
-/// Files under image names that hold no image. Each must be refused.
+/// Writes files with image names and invalid contents. Each must be refused.
 pub(crate) fn write_broken(folder: &Path, good: &RgbU8) -> Vec<String> {
     let png = cv_io::encode_png(good.view()).unwrap();
     let jpeg = cv_io::encode_jpeg(good.view(), 90).unwrap();
-    // 100,000 × 100,000 pixels by its header, no data: must be refused without asking for the memory.
+    // 100,000 × 100,000 pixels in the header, no data: must be refused before allocation.
     let mut bomb = png[..33].to_vec();
     bomb[16..24].copy_from_slice(&[0, 1, 0x86, 0xa0, 0, 1, 0x86, 0xa0]);
     let files: [(&str, &[u8]); 8] = [
@@ -93,7 +93,7 @@ pub(crate) fn write_broken(folder: &Path, good: &RgbU8) -> Vec<String> {
         ("cut.png", &png[..png.len() / 2]),
         ("head.png", &png[..20]),
         ("head.jpg", &jpeg[..20]),
-        ("text.png", b"this is not a picture\n"),
+        ("text.png", b"this is not an image\n"),
         ("zeros.jpg", &[0; 4096]),
         ("bomb.png", &bomb),
     ];
@@ -104,8 +104,8 @@ pub(crate) fn write_broken(folder: &Path, good: &RgbU8) -> Vec<String> {
     files.iter().map(|(name, _)| (*name).to_owned()).chain(["missing.png".into(), "folder.png".into()]).collect()
 }
 
-/// The same picture in every dress that loses nothing. Each must give the same result as the plain PNG.
-pub(crate) fn write_dressed(folder: &Path, stem: &str, image: &RgbU8) -> Vec<String> {
+/// Writes an image in every lossless format. Each must give the same result as the plain PNG.
+pub(crate) fn write_lossless_variants(folder: &Path, stem: &str, image: &RgbU8) -> Vec<String> {
     let name = |ending: &str| format!("{stem}-{ending}");
     let png = cv_io::encode_png(image.view()).unwrap();
     let deep = image.map(|p| p.map(|v| u16::from(v) * 257));
@@ -121,7 +121,7 @@ pub(crate) fn write_dressed(folder: &Path, stem: &str, image: &RgbU8) -> Vec<Str
     ["plain.png", "misnamed.jpg", "nameless", "deep.png", "alpha.png", "plain.ppm"].map(name).to_vec()
 }
 
-/// The picture as a CMYK JPEG, as print shops make them (Adobe's inverted inks).
+/// Writes an image as a CMYK JPEG with inverted inks (Adobe's convention).
 pub(crate) fn write_cmyk(path: &Path, image: &RgbU8) {
     let inks: Vec<u8> = image.pixels().flat_map(|[r, g, b]| [255 - r, 255 - g, 255 - b, 0]).collect();
     let mut bytes = Vec::new();
@@ -130,22 +130,22 @@ pub(crate) fn write_cmyk(path: &Path, image: &RgbU8) {
     fs::write(path, bytes).unwrap();
 }
 
-/// A command that takes pictures: how to call it and what it writes.
+/// A command that reads images: its arguments and outputs.
 pub(crate) struct Job {
-    /// For messages.
+    /// Name in messages.
     pub(crate) name: &'static str,
-    /// The fixtures it is given, in order.
+    /// Its fixtures, in order.
     pub(crate) inputs: &'static [&'static str],
-    /// The arguments, `{0}` standing for the first input and so on. Paths are relative to the folder it runs in.
+    /// Arguments; `{0}` is replaced by the first input and so on. Paths are relative to the working folder.
     pub(crate) args: &'static str,
-    /// Whether it makes random choices, and so takes a seed.
+    /// Whether it makes random choices, and so has a seed.
     pub(crate) random: bool,
-    /// The files it writes.
+    /// Output files.
     pub(crate) outputs: &'static [&'static str],
 }
 
 impl Job {
-    /// The arguments for these input files.
+    /// Returns the arguments for these input files.
     pub(crate) fn args(&self, inputs: &[String]) -> Vec<String> {
         let fill = |word: &str| {
             inputs.iter().enumerate().fold(word.to_owned(), |text, (i, input)| text.replace(&format!("{{{i}}}"), input))
@@ -153,12 +153,12 @@ impl Job {
         self.args.split_whitespace().map(fill).collect()
     }
 
-    /// The pictures of the inputs.
-    pub(crate) fn pictures(&self) -> Vec<RgbU8> {
+    /// Reads the input images.
+    pub(crate) fn images(&self) -> Vec<RgbU8> {
         self.inputs.iter().map(|name| cv_io::read_rgb(fixture(name)).unwrap()).collect()
     }
 
-    /// A folder in which the job can run, and the names of the inputs in it.
+    /// Creates a folder in which the job can run; also returns the names of its inputs.
     pub(crate) fn folder(&self) -> (tempfile::TempDir, Vec<String>) {
         let folder = tempfile::tempdir().unwrap();
         let names = self.inputs.iter().enumerate().map(|(i, name)| {
@@ -171,16 +171,16 @@ impl Job {
         (folder, names)
     }
 
-    /// What the job needs beside its pictures.
+    /// Writes the job's other inputs.
     fn prepare(&self, folder: &Path) {
         if self.args.contains("--masks") {
-            // A mask for each name that a test may give the picture.
+            // A mask for each name under which a test may store the image.
             fs::create_dir(folder.join("masks")).unwrap();
             for i in 0..self.inputs.len() {
-                let dressed = ["", "-plain", "-misnamed", "-nameless", "-deep", "-alpha"].map(|d| format!("in{i}{d}"));
+                let variants = ["", "-plain", "-misnamed", "-nameless", "-deep", "-alpha"].map(|d| format!("in{i}{d}"));
                 let broken = ["empty", "cut", "head", "text", "zeros", "bomb", "missing", "folder"].map(str::to_owned);
                 let others = [format!("cmyk{i}"), odd_name(&format!("in{i}"))];
-                for stem in dressed.into_iter().chain(broken).chain(others) {
+                for stem in variants.into_iter().chain(broken).chain(others) {
                     let mask = fixture(&format!("oracle/ball-masks/ball{i}_mask.png"));
                     fs::copy(mask, folder.join(format!("masks/{stem}_mask.png"))).unwrap();
                 }
@@ -193,12 +193,12 @@ impl Job {
         }
     }
 
-    /// The outputs that are single files.
+    /// Returns the outputs that are single files.
     pub(crate) fn files(&self) -> Vec<&'static str> {
         self.outputs.iter().copied().filter(|name| !name.ends_with('/')).collect()
     }
 
-    /// The bytes of all outputs. Folders are emptied: the next run may give its files other names.
+    /// Returns the bytes of all outputs. Folders are removed: the next run may use other file names.
     pub(crate) fn written(&self, folder: &Path) -> Vec<Vec<u8>> {
         let mut bytes = Vec::new();
         for name in self.outputs {
@@ -214,22 +214,22 @@ impl Job {
     }
 }
 
-/// A name with spaces and letters of several scripts.
+/// Returns a name with spaces and letters of several scripts.
 pub(crate) fn odd_name(name: &str) -> String {
     format!("Überfahrt № 1 – {name}")
 }
 
-/// A file under `fixtures/` at the root of the workspace.
+/// Returns the path of a file under `fixtures/` at the root of the workspace.
 pub(crate) fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fixtures").join(name)
 }
 
-/// Borrows, as the program's arguments.
+/// Borrows the arguments.
 pub(crate) fn strs(args: &[String]) -> Vec<&str> {
     args.iter().map(String::as_str).collect()
 }
 
-/// The commands that take pictures.
+/// The commands that read images.
 pub(crate) const JOBS: &[Job] = &[
     Job {
         name: "depth",

@@ -208,9 +208,9 @@ fn every_exif_orientation_is_applied() {
     for (k, place) in places.iter().enumerate() {
         let fields = [(Tag::Orientation, Value::Short(vec![k as u16 + 1]))];
         for bytes in [png_with_exif(&stored, &fields), jpeg_with_exif(&stored, &fields)] {
-            let picture = decoded(&bytes);
-            assert_eq!(picture.exif.orientation, k as u8 + 1);
-            let seen = picture.into_rgb8();
+            let file = decoded(&bytes);
+            assert_eq!(file.exif.orientation, k as u8 + 1);
+            let seen = file.into_rgb8();
             assert_eq!(seen.size(), if k >= 4 { (16, 24) } else { (24, 16) });
             for (x, y) in [(0, 0), (23, 0), (0, 15), (12, 9)] {
                 let (sx, sy) = place(x, y, 24, 16);
@@ -322,8 +322,8 @@ fn the_focal_length_refers_to_the_upright_image() {
     std::fs::write(&path, jpeg_with_exif(&ramp(60, 40), &fields)).unwrap();
     let (size, info) = read_image_info(&path).unwrap();
     assert_eq!((size, info.orientation), ((40, 60), 6));
-    let picture = read_image(&path).unwrap();
-    assert_eq!((picture.size(), picture.exif.focal), (size, info.focal));
+    let file = read_image(&path).unwrap();
+    assert_eq!((file.size(), file.exif.focal), (size, info.focal));
 }
 
 #[test]
@@ -396,14 +396,14 @@ fn cmyk_jpegs_are_converted_to_rgb() {
 #[test]
 fn linear_intensity_is_srgb_encoded() {
     let light = [[0.0, 1.0, 0.5], [0.0, 0.003_130_8, 2.0], [-1.0, 0.18, 0.18], [f32::NAN, 0.0, 1.0]];
-    let picture = DynImage {
+    let file = DynImage {
         pixels: Pixels::RgbF32(RgbF32::from_fn(4, 1, |x, _| light[x])),
         exif: ExifInfo::default(),
         metadata: Metadata::default(),
     };
     // IEC 61966-2-1 at 0.5, at its corner, and at the photographer's gray.
     let expected = [0, 255, 188, 0, 10, 255, 0, 118, 118, 0, 0, 255];
-    assert_eq!(picture.into_rgb8().as_slice(), expected);
+    assert_eq!(file.into_rgb8().as_slice(), expected);
 }
 
 #[test]
@@ -588,8 +588,8 @@ proptest! {
             bytes.truncate(usize::from(cut) % len);
         }
         let limit = 1 << 16;
-        if let Ok(picture) = decode_image(&bytes, &ReadOptions { max_pixels: limit, ..ReadOptions::default() }) {
-            let (w, h) = picture.size();
+        if let Ok(file) = decode_image(&bytes, &ReadOptions { max_pixels: limit, ..ReadOptions::default() }) {
+            let (w, h) = file.size();
             prop_assert!((w * h) as u64 <= limit && w * h > 0, "{}: {}×{}", name, w, h);
         }
     }

@@ -53,7 +53,7 @@ pub enum PtoError {
         key: &'static str,
         /// Its value.
         value: f64,
-        /// What is supported.
+        /// Supported alternatives.
         range: &'static str,
     },
     /// The content is not a valid registration.
@@ -105,7 +105,7 @@ impl Lens {
         let unit = 0.5 * camera.width.min(camera.height) as f64;
         let shift = [camera.cx - middle(camera.width), camera.cy - middle(camera.height)];
         let plain = Self { focal: camera.fx, a: 0.0, b: 0.0, c: 0.0, shift, unit };
-        // r_photo = e1 ρ + e2 ρ² + e3 ρ³ + e4 ρ⁴, of the distance ρ at which a pinhole of focal length 1 sees the same.
+        // r_photo = e1 ρ + e2 ρ² + e3 ρ³ + e4 ρ⁴, where ρ is the radius in a pinhole image of focal length 1.
         let radial = camera.distortion.converted(DistortionModel::SimpleRadial);
         let coefficients = match radial.as_ref().map(Distortion::parameters) {
             _ if camera.distortion.is_none() => return plain,
@@ -477,8 +477,8 @@ mod tests {
     }
 
     #[test]
-    fn a_project_has_the_angles_that_panorama_tools_mean() {
-        // A camera turned to the right sees what lies there in its middle; one that is rolled clockwise sees what lies to the right below.
+    fn a_project_has_the_angles_of_panorama_tools() {
+        // A camera rotated to the right has directions on the right at its center; one rolled clockwise has them at the lower right.
         let ahead = |r: f64, p: f64, y: f64, ray: Vector3<f64>| rotation(r, p, y) * ray;
         assert!((ahead(0.0, 0.0, 0.3, Vector3::new(0.3_f64.sin(), 0.0, 0.3_f64.cos())) - Vector3::z()).norm() < 1e-12);
         // Pitch is up, and Y points down.
@@ -514,7 +514,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_written_is_what_is_read(k1 in -0.2..0.2_f64, roll in -3.1..3.1_f64, pitch in -1.5..1.5_f64, yaw in -3.1..3.1_f64) {
+        fn projects_round_trip(k1 in -0.2..0.2_f64, roll in -3.1..3.1_f64, pitch in -1.5..1.5_f64, yaw in -3.1..3.1_f64) {
             let lens = Distortion::simple_radial(k1);
             let alignment = Alignment {
                 views: vec![Ok(view(roll, pitch, yaw, lens))],
@@ -536,8 +536,8 @@ mod tests {
     }
 
     #[test]
-    fn lenses_that_the_format_lacks_are_fitted_and_the_error_is_told() {
-        // A barrel that draws corners in by a tenth: the even powers of one polynomial by all of another. What is tangential is not written at all: a pixel and a half.
+    fn unsupported_lens_models_are_fitted_and_the_error_is_reported() {
+        // Barrel distortion of a tenth at the corners: even powers of one polynomial by all powers of another. Tangential distortion is not written: an error of 1.5 px.
         for (lens, most) in [
             (Distortion::new(DistortionModel::Radial, &[-0.25, 0.08]).unwrap(), 0.3),
             (Distortion::new(DistortionModel::RadialTangential5, &[-0.2, 0.05, 0.001, -0.001, 0.01]).unwrap(), 3.0),
@@ -545,7 +545,7 @@ mod tests {
             let made = registration(lens);
             let pto = made.to_pto(&canvas(Projection::Plane), (800, 500)).unwrap();
             assert!(pto.lens_error_px < most && pto.lens_error_px > 1e-6, "{}", pto.lens_error_px);
-            // What the file says of its lens is what the error says: the definition in the manual, evaluated here.
+            // The lens in the file has the reported error, evaluated by the definition of the manual.
             let line = pto.content.lines().find(|line| line.starts_with("i ")).unwrap();
             let line = Line::new(1, line).unwrap();
             let [a, b, c, v] = ["a", "b", "c", "v"].map(|key| line.number(key, &[]).unwrap());
@@ -588,7 +588,7 @@ mod tests {
         let (yaw, pitch) = (15_f64.to_radians(), 5_f64.to_radians());
         let want = Vector3::new(pitch.cos() * yaw.sin(), -pitch.sin(), pitch.cos() * yaw.cos());
         assert!((ahead - want).norm() < 1e-9, "{ahead}");
-        // A roll of 90° clockwise: the top of the photograph, a little above its middle, looks to the right.
+        // A roll of 90° clockwise: a pixel slightly above the photograph's center has a direction to the right.
         let top = views[1].ray(Point2::new(1499.5, 899.5)).unwrap();
         assert!(top.x.atan2(top.z) > yaw + 0.02, "{top}");
         assert_eq!(alignment.pairs.len(), 1);
@@ -597,7 +597,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_registration_cannot_hold_is_refused_with_its_line() {
+    fn unsupported_entries_are_refused_with_their_line() {
         let go = |line: &str| Registration::from_pto(&format!("# hugin\n{line}\n")).unwrap_err();
         assert_eq!(Registration::from_pto("").unwrap_err(), PtoError::NoPhotographs);
         assert_eq!(go("i w3000 h2000 f0"), PtoError::Number { line: 2, key: "v" });
@@ -638,7 +638,7 @@ mod tests {
     }
 
     #[test]
-    fn the_canvas_of_a_project_has_our_pixels() {
+    fn the_canvas_of_a_project_has_the_same_pixels() {
         for (x, y, w, h) in
             [(-400.0, -250.5, 801, 502), (-17.0, 33.0, 400, 10), (12.5, -90.5, 7, 60), (-99.5, -1.0, 120, 90)]
         {
@@ -647,7 +647,7 @@ mod tests {
             let words = Line::new(1, &line).unwrap();
             let [pw, ph, v] = ["w", "h", "v"].map(|key| words.number(key, &[]).unwrap());
             let cut: Vec<f64> = words.value("S").unwrap().split(',').map(|v| v.parse().unwrap()).collect();
-            // Within the canvas, of our size, at our places, at our scale.
+            // The canvas has the same size, positions and scale.
             assert!(cut[0] >= 0.0 && cut[1] <= pw && cut[2] >= 0.0 && cut[3] <= ph, "{line}");
             assert_eq!((cut[1] - cut[0], cut[3] - cut[2]), (w as f64, h as f64), "{line}");
             assert_eq!((cut[0] - 0.5 * (pw - 1.0), cut[2] - 0.5 * (ph - 1.0)), (x, y), "{line}");
@@ -656,7 +656,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_circle_is_no_wider_than_one() {
+    fn the_width_of_a_full_circle_is_one_period() {
         let line = canvas_line(
             &Canvas { origin: Point2::new(-1570.0, -100.0), ..canvas(Projection::Cylindrical) },
             (3142, 200),

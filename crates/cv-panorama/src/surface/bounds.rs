@@ -69,7 +69,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_rectangle_meets_another_and_grows_within_the_canvas() {
+    fn rectangles_are_intersected_and_expanded_within_the_canvas() {
         let b = Bounds { left: 5, top: 2, right: 20, bottom: 9 };
         assert_eq!((b.width(), b.height()), (15, 7));
         assert!(b.contains(5, 8) && !b.contains(20, 8) && !b.contains(5, 9));
@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn for_a_pyramid_a_rectangle_starts_at_whole_pixels_of_every_level() {
+    fn a_rectangle_for_a_pyramid_is_aligned_to_the_pixels_of_every_level() {
         let b = Bounds { left: 37, top: 70, right: 50, bottom: 75 };
         // Grown by 16, rounded out to multiples of 8.
         assert_eq!(b.for_pyramid(3, 1000, 90), Bounds { left: 16, top: 48, right: 72, bottom: 90 });

@@ -88,7 +88,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn all_places_at_once_are_each_place_by_itself(half in 1_usize..9, seed in any::<u32>(), hole in 0_usize..2000) {
+        fn the_correlation_at_all_shifts_equals_that_at_single_shifts(half in 1_usize..9, seed in any::<u32>(), hole in 0_usize..2000) {
             let side = 2 * half + 1;
             let wide = side + 2 * SEARCH_RADIUS;
             let mut state = seed;
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn a_patch_is_found_where_it_was_cut_out() {
+    fn a_patch_has_its_maximum_correlation_at_its_position() {
         let (side, wide) = (9, 9 + 2 * SEARCH_RADIUS);
         let mut window: Vec<f32> = (0..wide * wide)
             .map(|i| (i as u32).wrapping_mul(2_654_435_761).rotate_left(13).wrapping_mul(1_664_525) >> 24)

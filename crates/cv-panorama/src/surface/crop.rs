@@ -48,7 +48,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_rectangle_of_true_pixels_is_larger(w in 1..8_usize, h in 1..7_usize, bits in any::<u64>()) {
+        fn the_crop_is_the_largest_covered_rectangle(w in 1..8_usize, h in 1..7_usize, bits in any::<u64>()) {
             let mask = Mask::from_fn(w, h, |x, y| [bits >> (y * w + x) & 1 == 1]);
             let full = |b: &Bounds| (b.top..b.bottom).all(|y| (b.left..b.right).all(|x| mask.at(x, y)[0]));
             let mut largest = 0;

@@ -155,7 +155,7 @@ mod tests {
 
     const BOUNDS: Bounds = Bounds { left: 10, top: 20, right: 110, bottom: 80 };
 
-    /// A field whose displacement is affine in the position: interpolation gives it back everywhere on the grid.
+    /// A field with an affine displacement, which interpolation reproduces exactly on the grid.
     fn affine(spacing: f64) -> DisplacementField {
         let mut field = DisplacementField::over(&BOUNDS, spacing);
         for i in 0..field.displacement.len() {
@@ -183,12 +183,12 @@ mod tests {
         }
 
         #[test]
-        fn a_row_of_shifts_is_the_field_at_each_pixel(y in 20..79_usize, left in 10..60_usize, spacing in 8.0..30.0_f64) {
+        fn displacements_of_a_row_equal_those_of_single_pixels(y in 20..79_usize, left in 10..60_usize, spacing in 8.0..30.0_f64) {
             let (mut us, mut vs) = (vec![5.0; 50], vec![-3.0; 50]);
             affine(spacing).add_row(y as f64, left as f64, &mut us, &mut vs);
             for (i, (u, v)) in us.iter().zip(&vs).enumerate() {
                 let want = displacement(Point2::new((left + i) as f64, y as f64));
-                // Single precision of numbers up to ten.
+                // Single-precision rounding of numbers up to ten.
                 prop_assert!((f64::from(*u) - 5.0 - want.y).abs() < 1e-4 && (f64::from(*v) + 3.0 - want.x).abs() < 1e-4);
             }
         }
@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn outside_the_grid_the_nearest_position_counts() {
+    fn the_field_is_extended_by_the_nearest_position() {
         let field = affine(10.0);
         let far = field.at(Point2::new(-1000.0, 50.0));
         assert!((far - field.at(Point2::new(field.left, 50.0))).norm() < 1e-9);
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn the_shift_of_the_source_undoes_the_displacement() {
+    fn the_source_displacement_inverts_the_field() {
         let surface = Surface { projection: Projection::Cylindrical, scale: 90.0 };
         let view = View {
             camera: Camera::from_focal(200, 150, 100.0),
@@ -220,7 +220,7 @@ mod tests {
         let mut field = affine(10.0);
         field.update_source_shift(&placement, &surface);
         let project = |p: Point2<f64>| view.project(&surface.inverse(p + placement.origin.coords)).unwrap();
-        // At a vertex the shifted pixel is exactly what the undisplaced position shows.
+        // At a vertex, the shifted pixel equals the source of the undisplaced position.
         for (column, row) in [(1, 1), (4, 3), (8, 5)] {
             let p = Point2::new(field.left + 10.0 * column as f64, field.top + 10.0 * row as f64);
             let (mut u, mut v) = ([project(p).x as f32], [project(p).y as f32]);
@@ -228,7 +228,7 @@ mod tests {
             let want = project(p - displacement(p));
             assert!((f64::from(u[0]) - want.x).abs() < 1e-3 && (f64::from(v[0]) - want.y).abs() < 1e-3, "{p}");
         }
-        // And the map says so too, where the photograph is seen.
+        // The map agrees, where the photograph covers the canvas.
         let map = PhotoMap { surface, corner: Vector2::zeros(), pieces: vec![(placement, Some(field))] };
         let p = Point2::new(60.0, 50.0);
         assert!((map.source(0, p).unwrap() - project(p - displacement(p))).norm() < 1e-9);

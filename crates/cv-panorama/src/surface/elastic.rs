@@ -500,7 +500,7 @@ mod tests {
         let layout = layout(&alignment, Projection::Cylindrical, &Framing::default(), 1.0, 1_000_000).unwrap();
         let fields = displacements(&[photos[0].view(), photos[1].view()], &layout, &alignment, &Silent).unwrap();
         for field in fields.iter().flatten() {
-            // What registering patches of rounded gray levels is good to.
+            // The accuracy of patch registration with gray levels rounded to integers.
             assert!(field.displacement.iter().all(|d| d.norm() < 0.1), "{:?}", field.displacement);
         }
     }
@@ -522,7 +522,7 @@ mod tests {
     }
 
     #[test]
-    fn conjugate_gradients_find_the_direct_solution() {
+    fn conjugate_gradients_converge_to_the_direct_solution() {
         // A chain of springs of different strength, each vertex tied to zero.
         let n = 40;
         let mut matrix = DMatrix::<f64>::from_diagonal_element(n, n, 0.3);
@@ -561,12 +561,12 @@ mod tests {
         };
         let first = patch(PATCH_RADIUS, Vector2::zeros());
         for offset in [Vector2::new(0.0, 0.0), Vector2::new(3.3, -2.6), Vector2::new(-4.5, 1.2)] {
-            // The content of the first lies at `offset` in the second.
+            // The content of the first patch is at `offset` in the second.
             let found = register(&first, patch(PATCH_RADIUS + SEARCH_RADIUS, -offset)).unwrap();
             // A patch is about one wave long, so its mean and energy change with its position: that moves the peak by a tenth or two.
             assert!((found - offset).norm() < 0.2, "{found} {offset}");
         }
-        // Where nothing is alike.
+        // Unrelated patches.
         let side = 2 * (PATCH_RADIUS + SEARCH_RADIUS) + 1;
         assert_eq!(register(&first, vec![128.0; side * side]), None);
         assert!(corner_strength(&first) > MIN_CORNER_STRENGTH);

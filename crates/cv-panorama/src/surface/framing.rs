@@ -45,7 +45,7 @@ impl Framing {
     /// Returns the rotation from a level world centered at longitude `middle` to the surface; `pitch` is the default where `center` is `None`.
     pub(crate) fn frame(&self, middle: f64, pitch: f64) -> Matrix3<f64> {
         let [yaw, pitch] = self.center.unwrap_or([0.0, pitch]);
-        // Y points down: what lies above is brought to the middle by a turn about X towards negative angles.
+        // Y points down: a negative rotation about X brings directions above the horizon to the center.
         let tilt = Rotation3::from_axis_angle(&Vector3::x_axis(), -pitch).into_inner();
         let roll = Rotation3::from_axis_angle(&Vector3::z_axis(), self.roll).into_inner();
         roll * tilt * turn(middle + yaw)
@@ -85,7 +85,7 @@ impl Window {
         [Self { max: Point2::new(middle, self.max.y), ..*self }, Self { min: Point2::new(middle, self.min.y), ..*self }]
     }
 
-    /// Returns whether a point of the edges lies at the top or the bottom.
+    /// Returns whether a point of the edges is at the top or the bottom.
     fn is_end(&self, p: Point2<f64>) -> bool {
         p.y <= self.min.y || p.y >= self.max.y
     }
@@ -173,23 +173,23 @@ mod tests {
     use cv_core::Camera;
 
     #[test]
-    fn a_frame_brings_what_is_asked_for_to_the_middle() {
+    fn the_requested_direction_is_at_the_center() {
         let framing = Framing { center: Some([0.3, 0.5]), ..Framing::default() };
         let (yaw, pitch) = (0.2 + 0.3_f64, 0.5_f64);
-        // 0.5 rad above the horizon, Y pointing down, 0.3 to the right of a middle at 0.2.
+        // 0.5 rad above the horizon (Y points down), 0.3 rad to the right of a center at 0.2 rad.
         let ray = Vector3::new(pitch.cos() * yaw.sin(), -pitch.sin(), pitch.cos() * yaw.cos());
         assert!((framing.frame(0.2, 9.0) * ray - Vector3::z()).norm() < 1e-12);
-        // Above the middle lies what is higher still.
+        // Higher directions are above the center.
         let above = Vector3::new(0.6_f64.cos() * yaw.sin(), -0.6_f64.sin(), 0.6_f64.cos() * yaw.cos());
         let seen = framing.frame(0.2, 9.0) * above;
         assert!(seen.y < -0.09 && seen.x.abs() < 1e-12);
-        // Turned clockwise by a right angle, what was above the middle lies to its right.
+        // After a roll of 90° clockwise, directions above the center are to its right.
         let seen = Framing { roll: FRAC_PI_2, ..framing }.frame(0.2, 9.0) * above;
         assert!(seen.x > 0.09 && seen.y.abs() < 1e-12);
     }
 
     #[test]
-    fn angles_that_are_none_are_refused_by_name() {
+    fn invalid_angles_are_refused_by_name() {
         let name = |framing: Framing| framing.check().unwrap_err().name;
         assert_eq!(Framing::default().check(), Ok(()));
         assert_eq!(name(Framing { center: Some([f64::NAN, 0.0]), ..Framing::default() }), "yaw");
@@ -201,7 +201,7 @@ mod tests {
         }
     }
 
-    /// The box around all of a fine grid of the window's points that a view sees: the definition, looked at everywhere.
+    /// Computes the bounding box of all visible points of a fine grid of the window: the definition by brute force.
     fn by_looking_everywhere(view: &View, surface: &Surface, window: &Window) -> Option<Window> {
         const N: usize = 400;
         let at = |i: usize, a: f64, b: f64| a + (b - a) * i as f64 / N as f64;
@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn the_boxes_are_those_of_all_that_is_seen() {
+    fn bounding_boxes_equal_those_of_dense_sampling() {
         // Ahead, behind, up, down, aside and aslant: over poles, cuts and points at infinity.
         let turns = [(0.0, 0.0), (3.1, 0.1), (0.3, 1.5), (2.0, -1.4), (1.5, 0.0), (-2.9, 0.7), (3.13, -0.6)];
         for projection in [
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn a_photograph_across_the_cut_has_a_box_on_either_side() {
+    fn a_photograph_across_the_cut_has_two_boxes() {
         let view = View {
             camera: Camera::from_focal(600, 400, 500.0),
             from_world: Rotation3::from_axis_angle(&Vector3::y_axis(), -3.0).into_inner(),
@@ -275,7 +275,7 @@ mod tests {
             (boxes[1].min.x, 100.0 * (3.0 - half)),
             (boxes[1].max.x, 100.0 * PI),
         ] {
-            // The border pixels' middles lie half a pixel within 300 px, a tenth of a surface pixel.
+            // The centers of border pixels are half a pixel inside, of 300 px: a tenth of a surface pixel.
             assert!((got - want).abs() < 0.5, "{boxes:?}");
         }
     }

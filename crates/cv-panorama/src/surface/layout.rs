@@ -422,7 +422,7 @@ mod tests {
     use super::*;
     use cv_core::{Camera, Named};
 
-    /// Photographs of 600 x 400 at focal length 500 (62 by 44 degrees), turned by these yaws and pitches.
+    /// Photographs of 600 × 400 px at focal length 500 px (62° by 44°), rotated by these yaws and pitches.
     fn alignment(turns: &[(f64, f64)]) -> Alignment {
         let views = turns
             .iter()
@@ -445,7 +445,7 @@ mod tests {
     const MANY: usize = 100_000_000;
 
     #[test]
-    fn the_surface_follows_the_field_of_view() {
+    fn the_projection_is_selected_by_the_field_of_view() {
         let chosen = |turns: &[(f64, f64)]| {
             layout(&alignment(turns), Projection::Auto, &Framing::default(), 1.0, MANY).unwrap().surface.projection
         };
@@ -455,14 +455,14 @@ mod tests {
     }
 
     #[test]
-    fn a_canvas_holds_every_photograph_wherever_the_world_frame_points() {
+    fn the_canvas_contains_every_photograph_in_any_world_frame() {
         for offset in [0.0, 2.0, 3.1, -3.0] {
             let set = alignment(&[(offset, 0.0), (offset + 0.4, 0.05)]);
             for projection in Projection::NAMES.iter().map(|(_, p)| *p) {
                 let l = layout(&set, projection, &Framing::default(), 1.0, MANY).unwrap();
                 assert_eq!(l.placements.len(), 2);
                 for p in &l.placements {
-                    // Every pixel of the photograph's border lies within its bounds.
+                    // Every border pixel of the photograph is inside its bounds.
                     for pixel in p.view.border(100) {
                         let q = l.surface.forward(&p.view.ray(pixel).unwrap()).unwrap() - p.origin;
                         assert!(
@@ -494,7 +494,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_surface_cannot_hold_is_an_error_with_the_numbers() {
+    fn a_field_too_wide_for_the_projection_is_an_error_with_the_numbers() {
         let wide = alignment(&[(-1.2, 0.0), (0.0, 0.0), (1.2, 0.0)]);
         // 62 + 138 = 200 degrees.
         match layout(&wide, Projection::Plane, &Framing::default(), 1.0, MANY) {
@@ -519,14 +519,14 @@ mod tests {
         assert!(layout(&straight_up, Projection::Auto, &Framing::default(), 1.0, MANY).is_ok());
     }
 
-    /// The set all around, in two rows, that shows everything but what lies more than 60° below or above the horizon.
+    /// A full circle of photographs in three rows, up to about 60° above and below the horizon.
     fn all_around() -> Alignment {
         let row = |pitch: f64| (0..10).map(move |k| (f64::from(k) * TAU / 10.0, pitch));
         alignment(&row(-0.6).chain(row(0.0)).chain(row(0.6)).collect::<Vec<_>>())
     }
 
     #[test]
-    fn surfaces_that_reach_to_infinity_are_cut_and_say_so() {
+    fn unbounded_projections_are_truncated_and_reported() {
         let set = all_around();
         let lay = |projection| layout(&set, projection, &Framing::default(), 0.2, MANY).unwrap();
         let stereographic = lay(Projection::Stereographic);
@@ -551,14 +551,14 @@ mod tests {
         assert!(ends.iter().any(|y| (y - 500.0 * PI).abs() < 1.0), "{ends:?}");
     }
 
-    /// The angle between what two pixels of a canvas show, in degrees.
+    /// Returns the angle between the directions of two canvas pixels, in degrees.
     fn angle(canvas: &Canvas, a: (f64, f64), b: (f64, f64)) -> f64 {
         let ray = |(x, y)| canvas.ray(Point2::new(x, y));
         ray(a).angle(&ray(b)).to_degrees()
     }
 
     #[test]
-    fn a_field_of_view_is_drawn_as_asked_for_and_empty_where_nothing_reaches() {
+    fn the_requested_field_of_view_is_rendered_and_empty_outside_the_photographs() {
         let set = all_around();
         for (projection, across, up) in [
             (Projection::Plane, 60.0_f64, 40.0_f64),
@@ -583,13 +583,13 @@ mod tests {
                 assert!((got - across).abs() < 0.12, "{projection:?} {got} {across}");
                 let got = angle(&l.canvas, (x, -0.5), (x, h - 0.5));
                 assert!((got - up).abs() < 0.12, "{projection:?} {got} {up}");
-                // The middle of the picture looks where it was told to.
+                // The center of the canvas has the requested direction.
                 let [yaw, pitch] = center;
                 let want = Vector3::new(pitch.cos() * yaw.sin(), -pitch.sin(), pitch.cos() * yaw.cos());
                 assert!(l.canvas.ray(Point2::new(x, y)).normalize().dot(&want) > 1.0 - 1e-12);
             }
         }
-        // 62° of photographs in a picture of 120°.
+        // Photographs of 62° on a canvas of 120°.
         let one = alignment(&[(0.0, 0.0)]);
         let framing = Framing { across: Some(120_f64.to_radians()), ..Framing::default() };
         let l = layout(&one, Projection::Cylindrical, &framing, 1.0, MANY).unwrap();
@@ -604,7 +604,7 @@ mod tests {
     }
 
     #[test]
-    fn a_field_that_cannot_be_drawn_is_refused_with_its_numbers() {
+    fn an_invalid_field_of_view_is_refused_with_the_numbers() {
         let set = alignment(&[(0.0, 0.0), (0.4, 0.0)]);
         let go = |projection, framing: Framing| layout(&set, projection, &framing, 1.0, MANY).unwrap_err();
         let wide = |degrees: f64| Framing { across: Some(degrees.to_radians()), ..Framing::default() };

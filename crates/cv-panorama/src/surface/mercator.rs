@@ -41,7 +41,7 @@ impl Model for Mercator {
         true
     }
 
-    /// Never chosen by itself: a cylinder or a sphere is what viewers expect.
+    /// Never selected automatically: viewers expect a cylinder or a sphere.
     fn suits(&self, _: f64, _: f64) -> bool {
         false
     }
@@ -52,7 +52,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn heights_are_those_of_the_formula_and_end_at_a_square() {
+    fn heights_equal_the_formula_and_are_limited_to_a_square() {
         for degrees in [-80.0_f64, -30.0, 10.0, 60.0] {
             let (sin, cos) = degrees.to_radians().sin_cos();
             let p = Mercator.forward(&Vector3::new(0.6 * cos, sin, -0.8 * cos), 1.0).unwrap();

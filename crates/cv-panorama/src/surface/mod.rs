@@ -192,7 +192,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn going_to_the_surface_and_back_is_the_same_direction(x in -1.0..1.0f64, y in -0.9..0.9f64, z in -1.0..1.0f64, s in 10.0..5000.0f64) {
+        fn forward_and_inverse_projection_round_trip(x in -1.0..1.0f64, y in -0.9..0.9f64, z in -1.0..1.0f64, s in 10.0..5000.0f64) {
             let ray = Vector3::new(x, y, z);
             prop_assume!(ray.norm() > 0.1 && ray.x.hypot(ray.z) > 0.05);
             for (projection, _) in SURFACES {
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn a_radian_at_the_middle_is_the_scale_on_every_surface() {
+    fn the_scale_at_the_center_is_in_pixels_per_radian_on_every_surface() {
         for (projection, _) in SURFACES {
             let surface = Surface { projection, scale: 1000.0 };
             let p = surface.forward(&Vector3::new(1e-4, 2e-4, 1.0)).unwrap();
@@ -220,13 +220,13 @@ mod tests {
     }
 
     #[test]
-    fn what_the_surfaces_say_of_themselves_is_what_their_formulas_do() {
+    fn the_declared_limits_of_surfaces_agree_with_their_formulas() {
         for (projection, model) in SURFACES {
             let surface = Surface { projection, scale: 100.0 };
-            // Behind the camera there is only what goes around, and the stereographic plane, which goes everywhere.
+            // Only periodic and stereographic surfaces contain directions behind the camera.
             let behind = surface.period().is_some() || projection == Projection::Stereographic;
             assert_eq!(surface.forward(&Vector3::new(0.0, 0.1, -1.0)).is_some(), behind);
-            // What is drawn at the most ends where the formulas have numbers, and beyond it nothing is said to be drawn.
+            // The formulas are finite up to the widest field; beyond it the surface reports no size.
             let [across, up] = projection.widest_field();
             assert!(surface.half_size(across, up).iter().all(Option::is_some), "{projection:?}");
             for beyond in [1.01, 3.0, f64::NAN, f64::INFINITY, -0.1, 0.0] {
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn the_wider_and_the_higher_the_fewer_surfaces_suit() {
+    fn wider_and_higher_fields_have_fewer_suitable_projections() {
         let suitable =
             |across: f64, up: f64| Projection::suitable(across.to_radians(), up.to_radians()).collect::<Vec<_>>();
         assert_eq!(suitable(89.0, 44.0), [Projection::Plane, Projection::Cylindrical, Projection::Spherical]);

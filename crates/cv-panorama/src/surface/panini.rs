@@ -12,7 +12,7 @@ pub(super) struct Panini;
 impl Model for Panini {
     fn forward(&self, ray: &Vector3<f64>, scale: f64) -> Option<Point2<f64>> {
         let h = ray.x.hypot(ray.z);
-        // The same two ways; each where nothing cancels.
+        // Two equal expressions; each is used where it has no cancellation.
         let sum = if ray.z >= 0.0 { h + ray.z } else { ray.x * ray.x / (h - ray.z) };
         let holds = h > 1e-6 * ray.norm() && sum > 1e-9 * h;
         holds.then(|| Point2::new(2.0 * scale * ray.x / sum, 2.0 * scale * ray.y / sum))
@@ -34,7 +34,7 @@ impl Model for Panini {
         false
     }
 
-    /// 120° to each side, where it enlarges heights by S = 4 and widths by 1/cos²(60°) = 4, and as high as 75° lie in the middle.
+    /// 120° to each side, where heights are magnified by S = 4 and widths by 1/cos²(60°) = 4, and up to 75° above and below the center.
     fn field(&self) -> [f64; 2] {
         [240_f64.to_radians(), 150_f64.to_radians()]
     }
@@ -43,7 +43,7 @@ impl Model for Panini {
         true
     }
 
-    /// Never chosen by itself: what runs across the view bends.
+    /// Never selected automatically: horizontal lines are curved.
     fn suits(&self, _: f64, _: f64) -> bool {
         false
     }
@@ -55,7 +55,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn places_are_those_of_the_formulas() {
+    fn positions_equal_the_formulas() {
         // λ = 90°, φ = 45°: S = 2, x = 2, y = 2. λ = 120°: S = 4, x = 4 sin 120° = 2 √3.
         let p = Panini.forward(&Vector3::new(1.0, 1.0, 0.0), 100.0).unwrap();
         assert!((p - Point2::new(200.0, 200.0)).norm() < 1e-9, "{p}");
@@ -68,11 +68,11 @@ mod tests {
 
     proptest! {
         #[test]
-        fn verticals_and_lines_towards_the_middle_are_straight(x in -3.0..3.0_f64, y in -2.0..2.0_f64, z in 0.2..3.0_f64, t in 0.1..5.0_f64) {
+        fn verticals_and_radial_lines_are_straight(x in -3.0..3.0_f64, y in -2.0..2.0_f64, z in 0.2..3.0_f64, t in 0.1..5.0_f64) {
             let at = |x: f64, y: f64, z: f64| Panini.forward(&Vector3::new(x, y, z), 1.0).unwrap();
-            // A vertical in the world is one of the picture.
+            // A vertical of the scene is vertical in the panorama.
             prop_assert!((at(x, y, z).x - at(x, y + t, z).x).abs() < 1e-12);
-            // A line parallel to the Z axis ends in the middle of the picture: its points lie on one ray from there.
+            // A line parallel to the z axis is a straight line through the center of the panorama.
             let (p, q) = (at(x, y, z), at(x, y, z + t));
             prop_assert!((p.x * q.y - p.y * q.x).abs() < 1e-12 * (1.0 + p.coords.norm_squared()), "{p} {q}");
         }

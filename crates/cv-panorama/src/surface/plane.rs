@@ -36,7 +36,7 @@ impl Model for Plane {
         false
     }
 
-    /// Up to 45° from the middle: there it stretches lengths by 1/cos² = 2.
+    /// Up to 45° from the center, where lengths are magnified by 1/cos² = 2.
     fn suits(&self, across: f64, up: f64) -> bool {
         across <= 2.0 * FRAC_PI_4 && up <= FRAC_PI_4
     }

@@ -200,8 +200,8 @@ mod tests {
     use cv_core::{Camera, Matrix3, Point2, Silent};
 
     #[test]
-    fn the_preview_is_the_canvas_averaged() {
-        // A plane and a camera that looks straight at it: the canvas is the photograph.
+    fn the_preview_is_the_block_average_of_the_canvas() {
+        // A plane and a camera perpendicular to it: the canvas equals the photograph.
         let photo = RgbU8::from_fn(64, 48, |x, y| [(x * 3) as u8, (y * 5) as u8, 100]);
         let surface = Surface { projection: Projection::Plane, scale: 80.0 };
         let bounds = Bounds { left: 0, top: 0, right: 64, bottom: 48 };
@@ -226,7 +226,7 @@ mod tests {
         for y in 0..12 {
             for x in 0..16 {
                 let [r, g, b] = preview.pieces[0].warped.color(x, y).unwrap();
-                // The mean of a ramp over a block is its value at the block's middle, rounded.
+                // The mean of a ramp over a block is its value at the block's center, rounded.
                 assert!((f64::from(r) - 3.0 * (4.0 * x as f64 + 1.5)).abs() <= 1.0, "{x} {y} {r}");
                 assert!((f64::from(g) - 5.0 * (4.0 * y as f64 + 1.5)).abs() <= 1.0);
                 assert_eq!(b, 100);
@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn a_halved_piece_has_the_blocks_that_are_whole_and_wholly_reached() {
+    fn half_resolution_contains_only_complete_and_covered_blocks() {
         let bounds = Bounds { left: 3, top: 2, right: 10, bottom: 7 };
         // Canvas pixel (7, 4) is not reached.
         let pixels =
@@ -256,12 +256,12 @@ mod tests {
         assert_eq!(half.warped.color(3, 2), None);
         assert_eq!(half.warped.color(4, 2), Some([55, 50, 7]));
         assert_eq!(half.eccentricity, [1.0, 3.0, 5.0, 15.0, 17.0, 19.0]);
-        // Number 8 lies in the first block.
+        // Number 8 is in the first block.
         assert_eq!(half.clipped, [true, false, false, false, false, false]);
     }
 
     #[test]
-    fn halving_a_pixel_leaves_nothing() {
+    fn half_resolution_of_one_pixel_is_empty() {
         let bounds = Bounds { left: 3, top: 2, right: 4, bottom: 3 };
         let pixels = Image::new(1, 1, [9, 9, 9, 255]);
         let half = Piece {
@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn shrinking_keeps_means_and_something_of_every_photograph() {
+    fn downscaling_gives_block_means_and_at_least_one_pixel() {
         let photo = RgbU8::from_fn(5, 3, |x, _| [(10 * x) as u8, 0, 255]);
         assert_eq!(downsample_box(photo.view(), 2, &stage()).unwrap().as_slice(), [5, 0, 255, 25, 0, 255]);
         assert_eq!(downsample_box(photo.view(), 100, &stage()).unwrap().as_slice(), [20, 0, 255]);

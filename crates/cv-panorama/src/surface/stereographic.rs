@@ -11,7 +11,7 @@ pub(super) struct Stereographic;
 impl Model for Stereographic {
     fn forward(&self, ray: &Vector3<f64>, scale: f64) -> Option<Point2<f64>> {
         let n = ray.norm();
-        // The same two ways; each where nothing cancels.
+        // Two equal expressions; each is used where it has no cancellation.
         let sum = if ray.z >= 0.0 { n + ray.z } else { (ray.x * ray.x + ray.y * ray.y) / (n - ray.z) };
         (sum > 1e-12 * n).then(|| Point2::new(2.0 * scale * ray.x / sum, 2.0 * scale * ray.y / sum))
     }
@@ -32,7 +32,7 @@ impl Model for Stereographic {
         true
     }
 
-    /// 150° from the middle, where it enlarges by 1/cos²(75°) = 15; the point opposite to the middle lies at infinity.
+    /// 150° from the center, where lengths are magnified by 1/cos²(75°) = 15; the antipode of the center is at infinity.
     fn field(&self) -> [f64; 2] {
         [300_f64.to_radians(); 2]
     }
@@ -41,7 +41,7 @@ impl Model for Stereographic {
         true
     }
 
-    /// Never chosen by itself: it bends what people know to be straight.
+    /// Never selected automatically: straight lines are curved.
     fn suits(&self, _: f64, _: f64) -> bool {
         false
     }
@@ -66,7 +66,7 @@ mod tests {
     proptest! {
         /// The circle of all directions at one angle from an axis is a circle on the plane: four of its points lie on one.
         #[test]
-        fn circles_stay_circles(yaw in -1.5..1.5_f64, pitch in -1.0..1.0_f64, radius in 0.05..0.5_f64) {
+        fn circles_are_mapped_to_circles(yaw in -1.5..1.5_f64, pitch in -1.0..1.0_f64, radius in 0.05..0.5_f64) {
             let turn = nalgebra::Rotation3::from_euler_angles(pitch, yaw, 0.0);
             let at = |phi: f64| {
                 let ray = Vector3::new(radius.sin() * phi.cos(), radius.sin() * phi.sin(), radius.cos());

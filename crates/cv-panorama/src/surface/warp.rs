@@ -346,13 +346,13 @@ mod tests {
         }
     }
 
-    /// A smooth picture whose value at any point is known: interpolation errors stay under a gray level.
+    /// A smooth image with an analytic value at each point: interpolation errors are below one gray level.
     fn wave(u: f64, v: f64) -> [f64; 3] {
         [128.0 + 90.0 * (u * 0.05).sin(), 128.0 + 90.0 * (v * 0.06).cos(), 128.0 + 60.0 * ((u + v) * 0.03).sin()]
     }
 
     #[test]
-    fn every_surface_and_lens_shows_what_the_exact_projection_says() {
+    fn every_surface_and_lens_agrees_with_the_exact_projection() {
         let photo = RgbU8::from_fn(121, 91, |x, y| wave(x as f64, y as f64).map(|v| v.round() as u8));
         let bounds = Bounds { left: 3, top: 5, right: 118, bottom: 88 };
         for distortion in [
@@ -383,8 +383,8 @@ mod tests {
                             assert_eq!(a, 255);
                             let q = q.unwrap();
                             for (got, want) in [r, g, b].into_iter().zip(wave(q.x, q.y)) {
-                                // Half a level of rounding in the photograph, half in the result, curvature 90·0.06²/8 = 0.04
-                                // (more for repeated pixels at the border: one slope of 5.4 levels times nothing, as inside).
+                                // Half a level of rounding in the photograph, half in the result, and an interpolation error
+                                // of 90·0.06²/8 = 0.04 from the curvature.
                                 assert!(
                                     (f64::from(got) - want).abs() < 1.6,
                                     "{projection:?} {distortion:?} {x} {y}: {got} {want}"
@@ -399,7 +399,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_photograph_does_not_reach_repeats_its_edge_and_says_so() {
+    fn pixels_outside_the_photograph_repeat_its_edge_and_are_not_covered() {
         let photo = RgbU8::new(20, 10, [9, 80, 200]);
         let surface = Surface { projection: Projection::Spherical, scale: 20.0 };
         let bounds = Bounds { left: 0, top: 0, right: 126, bottom: 90 };
@@ -419,7 +419,7 @@ mod tests {
                     }
                 }
             }
-            // The sphere's pixels are as large as the photograph's at the middle, larger than those at its sides.
+            // The sphere's pixels are as large as the photograph's at the center, and larger at its sides.
             assert!((150..=230).contains(&reached), "{distortion:?} {reached}");
         }
     }
@@ -448,7 +448,7 @@ mod tests {
     }
 
     #[test]
-    fn every_pixel_is_the_plain_sample_at_the_displaced_position_corrected() {
+    fn every_pixel_is_the_corrected_sample_at_the_displaced_position() {
         let photo = RgbU8::from_fn(97, 73, |x, y| {
             let noise = |k: usize| ((x * 7919 + y * 104_729 + k * 1299) % 251) as u8;
             [noise(0), noise(1) / 2 + 60, noise(2) / 4 + 90]

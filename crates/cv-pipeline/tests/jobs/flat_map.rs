@@ -69,9 +69,9 @@ fn photograph(view: &View) -> RgbU8 {
 fn a_planar_map_of_twelve_views_becomes_an_orthophoto() {
     let camera = Camera { distortion: Distortion::radial(-0.08, 0.01), ..Camera::from_focal(SIZE.0, SIZE.1, FOCAL) };
     let truth = views(camera);
-    let pictures: Vec<RgbU8> = truth.iter().map(photograph).collect();
+    let images: Vec<RgbU8> = truth.iter().map(photograph).collect();
     let photos: Vec<PanoramaPhoto<'_>> =
-        pictures.iter().map(|p| PanoramaPhoto { camera: Some(camera), ..PanoramaPhoto::new(p.view()) }).collect();
+        images.iter().map(|p| PanoramaPhoto { camera: Some(camera), ..PanoramaPhoto::new(p.view()) }).collect();
     let plan = panorama(&photos, &PanoramaOptions::default(), &Silent).unwrap();
     // The matches show that the scene is planar.
     assert_eq!(plan.alignment.motion, CameraMotion::Homography);

@@ -29,7 +29,7 @@ fn known() -> Intrinsics {
 }
 
 #[test]
-fn a_plane_is_told_from_a_rotation_where_the_focal_length_is_known() {
+fn a_plane_is_distinguished_from_a_rotation_if_the_focal_length_is_known() {
     for seed in [1, 2] {
         let pair = homography_pair(seed, &camera(), 0.3, &RenderOptions::default()).unwrap();
         let (a, b) = (&pair.a.image, &pair.b.image);

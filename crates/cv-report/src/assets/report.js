@@ -2,7 +2,7 @@
 (() => {
   const box = document.createElement("dialog");
   const big = document.createElement("img");
-  box.setAttribute("aria-label", "Picture");
+  box.setAttribute("aria-label", "Image");
   box.append(big);
   document.body.append(box);
   document.querySelectorAll("figure img").forEach((img) => {

@@ -87,7 +87,7 @@ fn house(b: &mut SceneBuilder, [x, z, right]: [f64; 3], kind: usize, rng: &mut R
     let out = if x < 0.0 { 1.0 } else { -1.0 };
     let along = |s: f64| z + right * s;
     let frame = Texture::Paint { color: srgb(rng.pick([0xE6E2D8, 0x5A4636, 0x2F4F4F, 0x7A2E2A])), seed: rng.seed32() };
-    // A ledge, a door with its frame, and windows: panes with pictures behind, sills and lintels in relief.
+    // A ledge, a door with its frame, and windows: panes with textures behind, sills and lintels in relief.
     let ledge = rng.range(2.9, 3.2);
     b.object("ledge").block(
         at(x + out * 0.06, -ledge, along(HOUSE_WIDTH / 2.0)),

@@ -41,7 +41,7 @@ pub(super) fn outcome(job: &Job) -> Outcome {
             }
         }
     }
-    let picture = |view: usize, camera: usize| {
+    let image_json = |view: usize, camera: usize| {
         let of = &c.views[view].images[camera];
         json!({
             "path": job.path(view, camera).map(|p| p.display().to_string()),
@@ -54,10 +54,10 @@ pub(super) fn outcome(job: &Job) -> Outcome {
     };
     let views: Vec<Value> = (0..c.views.len())
         .map(|view| match job.names.as_slice() {
-            [_] => picture(view, 0),
+            [_] => image_json(view, 0),
             names => {
                 let mut all: Map<String, Value> =
-                    names.iter().enumerate().map(|(i, name)| (name.clone(), picture(view, i))).collect();
+                    names.iter().enumerate().map(|(i, name)| (name.clone(), image_json(view, i))).collect();
                 let used = found.refusals[view].iter().all(Option::is_none);
                 let corners = c.views[view].images.iter().flat_map(|p| &p.corners).filter(|c| c.used);
                 let (sum, n) =

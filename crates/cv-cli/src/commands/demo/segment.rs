@@ -28,8 +28,8 @@ pub(super) fn run(demo: &Demo<'_>) -> Result<Part, Failure> {
         let one = MaskScore::new(&found, &photo.mask).unwrap_or_default();
         score = score.plus(one);
         let caption = format!("The ball {:.2} m away: F1 {:.3}.", photo.distance, one.f1());
-        let picture = overlay_comparison(photo.view.image.view(), found.view(), photo.mask.view());
-        figures.push(demo.figure(&format!("segment-{}-result.png", i + 1), &picture, &caption)?);
+        let overlay = overlay_comparison(photo.view.image.view(), found.view(), photo.mask.view());
+        figures.push(demo.figure(&format!("segment-{}-result.png", i + 1), &overlay, &caption)?);
     }
     let pixels = |n: usize| format!("{n} px of ball");
     let check = Check::at_least("segment", "F1 over all test pixels", score.f1(), 0.97, "")

@@ -1,7 +1,7 @@
 //! Undistorted images and the model of their pinhole cameras: the input of dense reconstruction.
 
 use super::photographs::Photograph;
-use crate::commands::rectify::write_picture;
+use crate::commands::rectify::write_image;
 use crate::commands::undistort::undistorted_pixels;
 use crate::frame::{Context, Explain, Failure, Output, one_each, spare_inputs};
 use cv_core::{Camera, SparseModel, Stage};
@@ -53,10 +53,10 @@ impl<'a> PinholeFolder<'a> {
             };
             let photo = cv_io::read_image(&photographs[at].path)?;
             let pixels = undistorted_pixels(&photo.pixels, map)?;
-            let picture = DynImage { pixels, exif: ExifInfo::default(), metadata: Metadata::default() };
+            let file = DynImage { pixels, exif: ExifInfo::default(), metadata: Metadata::default() };
             let path = self.folder.join("images").join(&self.names[at]);
             let parent = path.parent().unwrap_or(self.folder);
-            context.write(Output::Folder(parent), |_| write_picture(&path, &picture, &photo.metadata))?;
+            context.write(Output::Folder(parent), |_| write_image(&path, &file, &photo.metadata))?;
             if let Some(image) = pinhole.images.get_mut(&id) {
                 image.name.clone_from(&self.names[at]);
             }
@@ -71,7 +71,7 @@ impl<'a> PinholeFolder<'a> {
 /// Returns the output name of a photograph: formats that are not written become PNG.
 fn writable(name: &str) -> String {
     let ending = Path::new(name).extension().unwrap_or_default().to_string_lossy().to_lowercase();
-    if crate::frame::PICTURE.contains(&&*ending) { name.to_owned() } else { format!("{name}.png") }
+    if crate::frame::IMAGE.contains(&&*ending) { name.to_owned() } else { format!("{name}.png") }
 }
 
 /// Returns the undistorted view of a camera with valid pixels only, as COLMAP's default.

@@ -1,4 +1,4 @@
-//! Every command that takes pictures, given good, odd and broken files.
+//! Every command that reads images, with valid, unusual and broken files.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
 
@@ -6,13 +6,13 @@ mod support;
 
 use cv_core::{GrayU8, Image, RgbU8};
 use std::fs;
-use support::{JOBS, done, odd_name, refused, run, snapshot, strs, write_broken, write_cmyk, write_dressed};
+use support::{JOBS, done, odd_name, refused, run, snapshot, strs, write_broken, write_cmyk, write_lossless_variants};
 
 #[test]
-fn a_file_that_is_no_picture_is_named_and_refused() {
+fn a_file_that_is_not_an_image_is_refused_by_name() {
     for job in JOBS {
         let (folder, good) = job.folder();
-        let broken = write_broken(folder.path(), &job.pictures()[0]);
+        let broken = write_broken(folder.path(), &job.images()[0]);
         let before = snapshot(folder.path());
         for bad in &broken {
             for place in 0..good.len() {
@@ -27,19 +27,19 @@ fn a_file_that_is_no_picture_is_named_and_refused() {
 }
 
 #[test]
-fn the_same_picture_in_another_file_format_gives_the_same_bytes() {
+fn the_same_image_in_another_file_format_gives_the_same_bytes() {
     for job in JOBS {
         let (folder, _) = job.folder();
-        let pictures = job.pictures();
-        let dressed: Vec<Vec<String>> = pictures
+        let images = job.images();
+        let variants: Vec<Vec<String>> = images
             .iter()
             .enumerate()
-            .map(|(i, picture)| write_dressed(folder.path(), &format!("in{i}"), picture))
+            .map(|(i, image)| write_lossless_variants(folder.path(), &format!("in{i}"), image))
             .collect();
         let mut expected = None;
-        for dress in 0..dressed[0].len() {
-            let inputs: Vec<String> = dressed.iter().map(|names| names[dress].clone()).collect();
-            // A panorama is as deep as its photographs (`tests/metadata.rs` holds those of 16 bits).
+        for variant in 0..variants[0].len() {
+            let inputs: Vec<String> = variants.iter().map(|names| names[variant].clone()).collect();
+            // A panorama has the bit depth of its photographs (`tests/metadata.rs` tests those of 16 bits).
             if job.name == "panorama" && inputs[0].contains("deep") {
                 continue;
             }
@@ -53,24 +53,24 @@ fn the_same_picture_in_another_file_format_gives_the_same_bytes() {
 }
 
 #[test]
-fn gray_and_cmyk_pictures_are_taken() {
+fn gray_and_cmyk_images_are_accepted() {
     for job in JOBS {
         let (folder, _) = job.folder();
         for (kind, ending) in [("gray", "png"), ("gray16", "png"), ("cmyk", "jpg")] {
-            // A color model cannot tell a gray ball from a gray floor; all else works on brightness.
+            // A color model cannot distinguish a gray ball from a gray floor; the other commands use intensity.
             if job.name.starts_with("segment") && kind != "cmyk" {
                 continue;
             }
             let mut inputs = Vec::new();
-            for (i, picture) in job.pictures().iter().enumerate() {
+            for (i, image) in job.images().iter().enumerate() {
                 let name = format!("{kind}{i}.{ending}");
                 let path = folder.path().join(&name);
                 let gray: GrayU8 =
-                    picture.map(|[r, g, b]| [((u32::from(r) + 2 * u32::from(g) + u32::from(b)) / 4) as u8]);
+                    image.map(|[r, g, b]| [((u32::from(r) + 2 * u32::from(g) + u32::from(b)) / 4) as u8]);
                 match kind {
                     "gray" => cv_io::write_png(&path, gray.view()).unwrap(),
                     "gray16" => cv_io::write_png(&path, gray.map(|[v]| [u16::from(v) * 257]).view()).unwrap(),
-                    _ => write_cmyk(&path, picture),
+                    _ => write_cmyk(&path, image),
                 }
                 inputs.push(name);
             }
@@ -81,7 +81,7 @@ fn gray_and_cmyk_pictures_are_taken() {
 }
 
 #[test]
-fn tiny_and_featureless_pictures_get_an_answer() {
+fn tiny_and_featureless_images_give_a_result_or_an_error() {
     let noise = |w, h| RgbU8::from_fn(w, h, |x, y| [(x * 97 + y * 57) as u8, (x * y * 31) as u8, (x * 13 + y) as u8]);
     let odd: [(&str, RgbU8); 7] = [
         ("one.png", RgbU8::new(1, 1, [90, 120, 30])),
@@ -94,18 +94,18 @@ fn tiny_and_featureless_pictures_get_an_answer() {
     ];
     for job in JOBS {
         let (folder, good) = job.folder();
-        for (name, picture) in &odd {
-            cv_io::write_png(folder.path().join(name), picture.view()).unwrap();
-            // All inputs odd, then one of them.
+        for (name, image) in &odd {
+            cv_io::write_png(folder.path().join(name), image.view()).unwrap();
+            // One input replaced, and all of them.
             for place in 0..=good.len() {
                 let mut inputs = good.clone();
                 match inputs.get_mut(place) {
                     Some(input) => input.clone_from(&(*name).to_owned()),
-                    // Each in a file of its own: the same file twice is wrong usage where each has a result.
+                    // Each in its own file: the same file twice is wrong usage if each has an output.
                     None => {
                         for (i, input) in inputs.iter_mut().enumerate() {
                             *input = format!("{i}-{name}");
-                            cv_io::write_png(folder.path().join(&input), picture.view()).unwrap();
+                            cv_io::write_png(folder.path().join(&input), image.view()).unwrap();
                         }
                     }
                 }
@@ -121,7 +121,7 @@ fn tiny_and_featureless_pictures_get_an_answer() {
 }
 
 #[test]
-fn a_picture_that_lies_about_its_turn_or_ends_in_rubbish_is_still_read() {
+fn an_image_with_trailing_bytes_is_read() {
     for job in JOBS {
         let (folder, good) = job.folder();
         done(folder.path(), &strs(&job.args(&good)));
@@ -152,16 +152,16 @@ fn names_with_spaces_and_other_scripts_work() {
 }
 
 #[test]
-fn webp_is_read_whole_and_what_is_none_is_refused() {
+fn webp_is_read_losslessly_and_truncated_files_are_refused() {
     let job = JOBS.iter().find(|job| job.name == "match").unwrap();
     let (folder, good) = job.folder();
     let mut inputs = Vec::new();
-    for (i, picture) in job.pictures().iter().enumerate() {
-        // The same picture without loss.
-        cv_io::write_png(folder.path().join(&good[i]), picture.view()).unwrap();
-        let (mut bytes, size) = (Vec::new(), (picture.width() as u32, picture.height() as u32));
+    for (i, image) in job.images().iter().enumerate() {
+        // A lossless copy of the same image.
+        cv_io::write_png(folder.path().join(&good[i]), image.view()).unwrap();
+        let (mut bytes, size) = (Vec::new(), (image.width() as u32, image.height() as u32));
         let encoder = image_webp::WebPEncoder::new(&mut bytes);
-        encoder.encode(picture.as_slice(), size.0, size.1, image_webp::ColorType::Rgb8).unwrap();
+        encoder.encode(image.as_slice(), size.0, size.1, image_webp::ColorType::Rgb8).unwrap();
         inputs.push(format!("in{i}.webp"));
         fs::write(folder.path().join(&inputs[i]), &bytes).unwrap();
         fs::write(folder.path().join("cut.webp"), &bytes[..bytes.len() / 2]).unwrap();
@@ -178,7 +178,7 @@ fn webp_is_read_whole_and_what_is_none_is_refused() {
 }
 
 #[test]
-fn a_fully_transparent_picture_is_read_by_its_colors() {
+fn a_fully_transparent_image_is_read_by_its_colors() {
     let clear: Image<u8, 4> = Image::new(32, 32, [10, 20, 30, 0]);
     for job in JOBS {
         let (folder, good) = job.folder();
@@ -189,7 +189,7 @@ fn a_fully_transparent_picture_is_read_by_its_colors() {
     }
 }
 
-/// Each photograph is read once: from a pipe there is nothing to be had the second time.
+/// Each photograph is read once: a pipe cannot be read a second time.
 #[cfg(unix)]
 #[test]
 fn photographs_are_read_once() {
@@ -202,13 +202,13 @@ fn photographs_are_read_once() {
             let bytes = fs::read(&path).unwrap();
             fs::remove_file(&path).unwrap();
             assert!(Command::new("mkfifo").arg(&path).status().unwrap().success());
-            // Ends when all of it has been read; who opens the pipe after that waits for ever.
+            // The thread ends when all has been read; a second open of the pipe would block forever.
             std::thread::spawn(move || fs::write(path, bytes));
         }
         let mut command = support::cv(folder.path());
         let mut child = command.args(job.args(&inputs)).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         let start = Instant::now();
-        // Far longer than a job on pictures this small takes on a machine that is busy.
+        // Far longer than a job on small images takes on a busy machine.
         while child.try_wait().unwrap().is_none() && start.elapsed() < Duration::from_secs(240) {
             std::thread::sleep(Duration::from_millis(20));
         }
