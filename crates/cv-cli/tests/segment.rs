@@ -63,7 +63,10 @@ fn training_prediction_and_evaluation_of_discs_succeed() {
     ] {
         assert!((number(&object[key][i]) - truth).abs() <= tolerance, "{key} {i}: {object}");
     }
-    assert!((number(&object["area"]) - 616.0).abs() < 60.0 && number(&object["angle_degrees"]).abs() <= 90.0, "{object}");
+    assert!(
+        (number(&object["area"]) - 616.0).abs() < 60.0 && number(&object["angle_degrees"]).abs() <= 90.0,
+        "{object}"
+    );
     // The model does not depend on the number of threads.
     done(folder, &["segment", "train", "--images", "train", "--masks", "train", "--model", "n.json", "--threads", "1"]);
     assert_eq!(fs::read(folder.join("m.json")).unwrap(), fs::read(folder.join("n.json")).unwrap());
