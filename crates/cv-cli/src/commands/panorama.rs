@@ -2,6 +2,7 @@
 
 mod registration;
 mod report;
+mod streamed;
 
 use crate::frame::{Context, Failure, Global, Outcome, Output, Run, Step, expand_images, named, spare_inputs, steps};
 use crate::{rig, words};
@@ -182,6 +183,9 @@ impl Run for Args {
         let results: Vec<PathBuf> = [&self.output].into_iter().chain(&self.save_registration).cloned().collect();
         let inputs: Vec<&Path> = paths.iter().chain(&self.registration).map(PathBuf::as_path).collect();
         spare_inputs(&results, &inputs)?;
+        if let Some(bytes) = context.max_memory {
+            return self.stitch_streamed(&paths, registration.as_ref(), bytes, context);
+        }
         let pictures = paths.par_iter().map(cv_io::read_image).collect::<Result<Vec<_>, _>>()?;
         let known: Vec<_> =
             pictures.iter().map(|p| (p.exif.focal.as_ref().map(|focal| focal.pixels), p.metadata.clone())).collect();
@@ -245,7 +249,8 @@ impl Args {
         };
         let result = result.map_err(|error| words::no_panorama(error, paths))?;
         let files: Vec<&Metadata> = known.iter().map(|(_, metadata)| metadata).collect();
-        let metadata = metadata(&files, &result);
+        let used = (0..files.len()).filter(|&index| result.images[index].used);
+        let metadata = metadata(&files, result.alignment.reference, used);
         context.write(Output::File(&self.output, ENDINGS), |path| {
             if let Some(radiance) = &result.radiance {
                 cv_io::write_exr(path, radiance.view())
@@ -255,8 +260,26 @@ impl Args {
                 cv_io::write_image(path, result.image.view(), &metadata)
             }
         })?;
+        self.conclude(paths, &result, context)?;
+        context.report(|| {
+            let photos: Vec<_> = images.iter().chain([&result.image]).map(Image::view).collect();
+            let photos = EightBits::new(&photos, "report", context)?;
+            report::report(paths, &photos.views(), result.labels.view(), &result)
+        })?;
+        Ok(outcome(paths, &result))
+    }
+}
+
+impl Args {
+    /// Writes the registration, and warns of what is wrong with a panorama.
+    fn conclude<T: PhotoSample>(
+        &self,
+        paths: &[PathBuf],
+        result: &PanoramaResult<T>,
+        context: &Context,
+    ) -> Result<(), Failure> {
         if let Some(path) = &self.save_registration {
-            registration::write(path, &result, paths, context)?;
+            registration::write(path, result, paths, context)?;
         }
         for (path, image) in paths.iter().zip(&result.images) {
             if let Some(reason) = &image.reason {
@@ -276,19 +299,15 @@ impl Args {
                 "the photographs reach beyond the {across:.0} by {up:.0} degrees of the {projection} projection and are cut off; --projection spherical draws all of them"
             ));
         }
-        context.report(|| {
-            let photos: Vec<_> = images.iter().chain([&result.image]).map(Image::view).collect();
-            report::report(paths, &EightBits::new(&photos, "report", context)?.views(), &result)
-        })?;
-        Ok(outcome(paths, &result))
+        Ok(())
     }
 }
 
 /// Returns the metadata of the reference photograph; its color profile only if all registered photographs share it.
-fn metadata<T>(files: &[&Metadata], result: &PanoramaResult<T>) -> Metadata {
-    let Some(reference) = files.get(result.alignment.reference) else { return Metadata::default() };
-    let mut used = files.iter().zip(&result.images).filter(|(_, image)| image.used);
-    let icc = reference.icc.clone().filter(|_| used.all(|(file, _)| file.icc == reference.icc));
+fn metadata(files: &[&Metadata], reference: usize, used: impl IntoIterator<Item = usize>) -> Metadata {
+    let Some(reference) = files.get(reference) else { return Metadata::default() };
+    let mut used = used.into_iter().filter_map(|index| files.get(index));
+    let icc = reference.icc.clone().filter(|_| used.all(|file| file.icc == reference.icc));
     Metadata { exif: reference.exif.clone(), icc }
 }
 
@@ -311,7 +330,7 @@ fn outcome<T: PhotoSample>(paths: &[PathBuf], result: &PanoramaResult<T>) -> Out
         })
         .collect();
     let used = result.images.iter().filter(|i| i.used).count();
-    let (w, h) = result.image.size();
+    let (w, h) = result.size;
     Outcome::new(result.stages.clone())
         .with("images", images)
         .with("size", [w, h])

@@ -8,8 +8,10 @@ mod alpha_expansion;
 mod cost;
 mod misalignment;
 mod upsample;
+mod windows;
 
-pub(crate) use upsample::upsample;
+pub(crate) use upsample::{upsample, upsample_rows};
+pub(crate) use windows::{refine_in_windows, window_memory};
 
 use crate::blend::NO_PHOTO;
 use crate::rows::{for_each_row, is_check_due};
@@ -155,8 +157,8 @@ pub(crate) fn refine(
     let stage = Stage::new(progress, "seams", 3)?;
     let pieces: Vec<Option<&WarpedPhoto>> = photos.iter().map(Option::as_ref).collect();
     let mut reach = 2 * step;
-    if step > BLOCK {
-        refine_blocks(labels, &pieces, reach.div_ceil(BLOCK), &stage)?;
+    if let Some(radius) = refined_block_radius(step) {
+        refine_blocks(labels, &pieces, radius, &stage)?;
         reach = BLOCK + BLOCK / 2;
     }
     stage.add(1)?;
@@ -167,6 +169,11 @@ pub(crate) fn refine(
     let free = |x: usize, y: usize| near[y * width + x];
     Labeling { photos: &pieces, unary: |_, _, _| 0, difference: differ, free }.expand(labels, 1, &stage)?;
     stage.add(1)
+}
+
+/// Returns by how many blocks seams are refined before single pixels, for a preview of this step; `None` where blocks are no smaller than its pixels.
+fn refined_block_radius(step: usize) -> Option<usize> {
+    (step > BLOCK).then(|| (2 * step).div_ceil(BLOCK))
 }
 
 /// Refines seams by up to `reach` blocks. The label of a block is that of its center; the difference is the maximum over four pixels.
@@ -184,11 +191,7 @@ fn refine_blocks(
     let subsampled: Vec<Option<WarpedPhoto>> = photos.iter().map(|photo| photo.map(subsampled)).collect();
     let reached: Vec<Option<&WarpedPhoto>> = subsampled.iter().map(Option::as_ref).collect();
     let near = seam_band(&before, reach, stage)?;
-    let differ = |a: usize, c: usize, x: usize, y: usize| {
-        let of = |x: usize, y: usize| difference(photos[a], photos[c], x, y);
-        let (x, y) = (BLOCK * x, BLOCK * y);
-        of(x, y).max(of(x + MIDDLE, y)).max(of(x, y + MIDDLE)).max(of(x + MIDDLE, y + MIDDLE))
-    };
+    let differ = |a: usize, c: usize, x: usize, y: usize| block_difference(photos, a, c, x, y);
     let free = |x: usize, y: usize| near[y * across + x];
     let mut after = before.clone();
     Labeling { photos: &reached, unary: |_, _, _| 0, difference: differ, free }.expand(&mut after, 1, stage)?;
@@ -206,12 +209,24 @@ fn refine_blocks(
     Ok(())
 }
 
+/// Returns the difference of two photographs in a block: the maximum over four pixels.
+fn block_difference(photos: &[Option<&WarpedPhoto>], a: usize, c: usize, x: usize, y: usize) -> i32 {
+    let of = |x: usize, y: usize| difference(photos[a], photos[c], x, y);
+    let (x, y, middle) = (BLOCK * x, BLOCK * y, BLOCK / 2);
+    of(x, y).max(of(x + middle, y)).max(of(x, y + middle)).max(of(x + middle, y + middle))
+}
+
+/// Returns the blocks whose centers lie inside the bounds.
+fn block_bounds(b: Bounds) -> Bounds {
+    // The first block whose middle is not before a column or row.
+    let block = |v: usize| v.saturating_sub(BLOCK / 2).div_ceil(BLOCK);
+    Bounds { left: block(b.left), top: block(b.top), right: block(b.right), bottom: block(b.bottom) }
+}
+
 /// Samples a photograph at the centers of the blocks.
 fn subsampled(photo: &WarpedPhoto) -> WarpedPhoto {
     let b = photo.bounds;
-    // The first block whose middle is not before a column or row.
-    let block = |v: usize| v.saturating_sub(BLOCK / 2).div_ceil(BLOCK);
-    let bounds = Bounds { left: block(b.left), top: block(b.top), right: block(b.right), bottom: block(b.bottom) };
+    let bounds = block_bounds(b);
     let middle = |v: usize| BLOCK * v + BLOCK / 2;
     let pixels = Image::from_fn(bounds.width(), bounds.height(), |x, y| {
         photo.pixels.at(middle(bounds.left + x) - b.left, middle(bounds.top + y) - b.top)
