@@ -9,7 +9,7 @@ mod multiband;
 mod poisson;
 
 pub(crate) use feather::MARGIN as FEATHER_MARGIN;
-pub(crate) use multiband::{CoarseLevels, coarse_margin};
+pub(crate) use multiband::{CoarseCanvas, CoarseLevels, coarse_margin};
 
 use crate::bit_depth::{Channel, PhotoSample};
 use crate::surface::WarpedPhoto;

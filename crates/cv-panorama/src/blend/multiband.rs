@@ -465,7 +465,7 @@ mod tests {
     /// Photographs of the whole canvas joined with so many bands.
     fn joined(photos: &[WarpedPhoto], labels: &Image<u16, 1>, bands: usize) -> Image<u8, 3> {
         let photos: Vec<_> = photos.iter().cloned().map(Some).collect();
-        join(&photos, labels, bands, &stage()).unwrap()
+        join(&photos, labels, bands, None, &stage()).unwrap()
     }
 
     fn scene(x: usize, y: usize) -> [u8; 3] {

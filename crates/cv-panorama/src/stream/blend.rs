@@ -2,7 +2,7 @@
 
 use super::{LabelRows, RowSink, WarpedStore};
 use crate::bit_depth::PhotoSample;
-use crate::blend::{BlendMode, CoarseLevels, Composition, FEATHER_MARGIN, NO_PHOTO, coarse_margin};
+use crate::blend::{BlendMode, CoarseCanvas, CoarseLevels, Composition, FEATHER_MARGIN, NO_PHOTO, coarse_margin};
 use crate::render::RenderError;
 use crate::rows::for_each_row;
 use crate::surface::Bounds;
@@ -67,52 +67,70 @@ impl<T: PhotoSample> Strips<'_, T> {
         } else {
             None
         };
+        // The rows of a strip are handed on while the next one is blended.
+        let mut ready: Option<Rows<T>> = None;
         for top in (first..shown.bottom).step_by(rows) {
-            let bottom = (top + rows).min(height);
-            let strip = Bounds {
-                left: 0,
-                top: top.saturating_sub(margin) / unit * unit,
-                right: width,
-                bottom: (bottom + margin).next_multiple_of(unit).min(height),
-            };
-            let photos = self.photos.crops(strip)?;
-            let labels = self.labels.window(strip);
-            let image = match &coarse {
-                Some(coarse) => coarse.strip(strip.top, &photos, &labels, &stage)?,
-                None => {
-                    let composition = Composition { photos: &photos, labels: &labels, typical_side: self.typical_side };
-                    self.mode.blender::<T>().blend(&composition, &stage)?
-                }
-            };
-            drop(photos);
-            let (from, to) = (top.max(shown.top), bottom.min(shown.bottom));
-            hand_on(&image, &labels, strip.top, shown, from..to, photo_of, output, &stage)?;
+            let (blended, handed) = rayon::join(
+                || self.strip(top, rows, margin, unit, shown, coarse.as_ref(), photo_of, &stage),
+                || ready.take().map_or(Ok(()), |rows| output.rows(rows.colors.view(), rows.labels.view())),
+            );
+            handed?;
+            ready = Some(blended?);
             stage.add(1)?;
+        }
+        if let Some(rows) = ready {
+            output.rows(rows.colors.view(), rows.labels.view())?;
         }
         Ok(())
     }
+
+    /// Blends the rows of `shown` from `top`, `rows` at most.
+    #[allow(clippy::too_many_arguments)]
+    fn strip(
+        &self,
+        top: usize,
+        rows: usize,
+        margin: usize,
+        unit: usize,
+        shown: Bounds,
+        coarse: Option<&CoarseCanvas>,
+        photo_of: &[usize],
+        stage: &Stage<'_>,
+    ) -> Result<Rows<T>, RenderError> {
+        let (width, height) = self.labels.size();
+        let bottom = (top + rows).min(height);
+        let strip = Bounds {
+            left: 0,
+            top: top.saturating_sub(margin) / unit * unit,
+            right: width,
+            bottom: (bottom + margin).next_multiple_of(unit).min(height),
+        };
+        let photos = self.photos.crops(strip)?;
+        let labels = self.labels.window(strip);
+        let image = match coarse {
+            Some(coarse) => coarse.strip(strip.top, &photos, &labels, stage)?,
+            None => {
+                let composition = Composition { photos: &photos, labels: &labels, typical_side: self.typical_side };
+                self.mode.blender::<T>().blend(&composition, stage)?
+            }
+        };
+        drop(photos);
+        let (from, to) = (top.max(shown.top), bottom.min(shown.bottom));
+        let part = Bounds { top: from - strip.top, bottom: to - strip.top, ..shown };
+        let (x, y, w, h) = (part.left, part.top, part.width(), part.height());
+        let (Some(colors), Some(names)) = (image.view().crop(x, y, w, h), labels.view().crop(x, y, w, h)) else {
+            return Ok(Rows { colors: image, labels });
+        };
+        let mut rows = Rows { colors: colors.to_image(), labels: names.to_image() };
+        for_each_row(rows.labels.as_mut_slice(), w, stage, |_, row| {
+            row.iter_mut().for_each(|l| *l = photo_of.get(usize::from(*l)).map_or(NO_PHOTO, |&p| p as u16));
+        })?;
+        Ok(rows)
+    }
 }
 
-/// Hands on the rows of a strip that begins at row `top`.
-#[allow(clippy::too_many_arguments)]
-fn hand_on<T: PhotoSample>(
-    image: &Image<T, 3>,
-    labels: &Image<u16, 1>,
-    top: usize,
-    shown: Bounds,
-    rows: std::ops::Range<usize>,
-    photo_of: &[usize],
-    output: &mut dyn RowSink<T>,
-    stage: &Stage<'_>,
-) -> Result<(), RenderError> {
-    let (x, y, w, h) = (shown.left, rows.start - top, shown.width(), rows.len());
-    let (Some(colors), Some(labels)) = (image.view().crop(x, y, w, h), labels.view().crop(x, y, w, h)) else {
-        return Ok(());
-    };
-    let mut names = labels.to_image();
-    for_each_row(names.as_mut_slice(), w, stage, |_, row| {
-        row.iter_mut().for_each(|l| *l = photo_of.get(usize::from(*l)).map_or(NO_PHOTO, |&p| p as u16));
-    })?;
-    output.rows(colors, names.view())?;
-    Ok(())
+/// Rows of the panorama, and the index of the photograph of each pixel.
+struct Rows<T> {
+    colors: Image<T, 3>,
+    labels: Image<u16, 1>,
 }

@@ -55,7 +55,7 @@ pub struct StreamedFrame {
 }
 
 /// Receives a panorama row by row.
-pub trait RowSink<T> {
+pub trait RowSink<T>: Send {
     /// Receives the frame, first of all.
     ///
     /// # Errors
@@ -214,9 +214,10 @@ impl Budget {
     }
 }
 
-/// Returns the memory in bytes per row of a strip: warped photographs that overlap by up to a half, their half resolution, the fine levels, labels, colors.
+/// Returns the memory in bytes per row of a strip: warped photographs that overlap by up to a half, their half resolution, the fine levels, colors and labels
+/// of this strip and of the one that is being written.
 fn strip_bytes<T>(width: usize) -> usize {
-    width * (2 * 4 * size_of::<T>() + 3 * size_of::<T>() + 2 * 4 + 8 + 4)
+    width * (2 * 4 * size_of::<T>() + 4 * 3 * size_of::<T>() + 2 * 4 + 8 + 8)
 }
 
 /// Implements [`render_streamed`].
@@ -438,3 +439,6 @@ fn warped<'s, T: PhotoSample>(
     }
     Ok(store)
 }
+
+#[cfg(test)]
+mod tests;
