@@ -1,7 +1,7 @@
 //! Writing images row by row, without the whole image in memory.
 
 use crate::encode::{JPEG_QUALITY, Parts, PngPixels, encode_jpeg_rows, png_writer, push_ycbcr};
-use crate::encode_tiff::{TiffLayout, TiffWriter};
+use crate::encode_tiff::{TiffLayout, TiffPosition, TiffWriter};
 use crate::files::write_atomic_file;
 use crate::{FormatError, IoError, Metadata};
 use jpeg_encoder::JpegColorType;
@@ -22,6 +22,7 @@ type Sink = BufWriter<File>;
 pub struct RowWriter<'a> {
     path: &'a Path,
     metadata: Metadata,
+    position: Option<TiffPosition>,
     file: Option<File>,
     /// Width and height; height counts the rows that are still to come.
     size: Option<(usize, usize)>,
@@ -50,6 +51,13 @@ impl RowWriter<'_> {
     /// Sets the metadata; before the first rows.
     pub fn set_metadata(&mut self, metadata: Metadata) {
         self.metadata = metadata;
+    }
+
+    /// Sets the position of the top left pixel in a larger canvas, in pixels, and the size of that canvas; before the first rows. TIFF has it in the fields XPosition
+    /// and YPosition (TIFF 6.0, section 12) in units of the resolution, as Hugin's and PTGui's cropped TIFF files; other formats drop it.
+    pub fn set_position(&mut self, (left, top): (usize, usize), (canvas_width, canvas_height): (usize, usize)) {
+        let [left, top, width, height] = [left, top, canvas_width, canvas_height].map(|v| v as u32);
+        self.position = Some(TiffPosition { left, top, width, height });
     }
 
     /// Sets the size in pixels; before the first rows.
@@ -103,7 +111,7 @@ impl RowWriter<'_> {
                 let depth = if depth == BitDepth::Sixteen { 2 } else { 1 };
                 let layout = TiffLayout::new(width, height, color.samples(), depth)?;
                 let sink = BufWriter::with_capacity(BUFFER_BYTES, file);
-                Ok(Encoder::Tiff(Box::new(TiffWriter::new(sink, layout, &self.metadata)?)))
+                Ok(Encoder::Tiff(Box::new(TiffWriter::new(sink, layout, &self.metadata, self.position)?)))
             }
             Some("jpg" | "jpeg") if depth == BitDepth::Eight && color == ColorType::Rgb => {
                 if width.max(height) > usize::from(u16::MAX) || width * height == 0 {
@@ -198,6 +206,7 @@ pub fn write_image_rows<R, E: From<IoError>>(
         let mut rows = RowWriter {
             path,
             metadata: Metadata::default(),
+            position: None,
             file: Some(file),
             size: None,
             rows_left: 0,

@@ -30,7 +30,7 @@ pub(crate) fn encode_samples(samples: &Samples<'_>, metadata: &Metadata) -> Resu
     let Samples { width, height, channels, depth, bytes } = *samples;
     let layout = TiffLayout::new(width, height, channels, depth)?;
     let mut file = Cursor::new(Vec::new());
-    let mut writer = TiffWriter::new(&mut file, layout, metadata)?;
+    let mut writer = TiffWriter::new(&mut file, layout, metadata, None)?;
     writer.write(bytes)?;
     writer.finish()?;
     Ok(file.into_inner())
@@ -97,6 +97,46 @@ impl TiffLayout {
     }
 }
 
+/// Position of an image in a larger canvas, in pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct TiffPosition {
+    pub(crate) left: u32,
+    pub(crate) top: u32,
+    /// Size of the canvas.
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+}
+
+/// Pixels per inch of files with a position, which is stored in inches.
+const POSITION_DPI: u32 = 150;
+
+impl TiffPosition {
+    fn add_to(self, fields: &mut Vec<Field>) {
+        let resolution = [Tag::XResolution, Tag::YResolution, Tag::ResolutionUnit];
+        fields.retain(|field| !resolution.contains(&field.tag));
+        let ratio = |tag: Tag, num: u32, denom: u32| {
+            let value = Value::Rational(vec![exif::Rational { num, denom }]);
+            Field { tag, ifd_num: In::PRIMARY, value }
+        };
+        let number = |tag: u16, value: u32| Field {
+            tag: Tag(Context::Tiff, tag),
+            ifd_num: In::PRIMARY,
+            value: Value::Long(vec![value]),
+        };
+        fields.extend([
+            ratio(Tag::XResolution, POSITION_DPI, 1),
+            ratio(Tag::YResolution, POSITION_DPI, 1),
+            Field { tag: Tag::ResolutionUnit, ifd_num: In::PRIMARY, value: Value::Short(vec![2]) },
+            // XPosition and YPosition.
+            ratio(Tag(Context::Tiff, 286), self.left, POSITION_DPI),
+            ratio(Tag(Context::Tiff, 287), self.top, POSITION_DPI),
+            // ImageFullWidth and ImageFullLength, as Hugin and PTGui write them.
+            number(33300, self.width),
+            number(33301, self.height),
+        ]);
+    }
+}
+
 /// Writes a TIFF file by rows: the fields first, with places for the positions of the strips, which are written at the end.
 pub(crate) struct TiffWriter<W> {
     sink: W,
@@ -116,9 +156,17 @@ impl<W: Write + Seek> TiffWriter<W> {
     ///
     /// # Errors
     /// [`FormatError::Os`].
-    pub(crate) fn new(mut sink: W, layout: TiffLayout, metadata: &Metadata) -> Result<Self, FormatError> {
+    pub(crate) fn new(
+        mut sink: W,
+        layout: TiffLayout,
+        metadata: &Metadata,
+        position: Option<TiffPosition>,
+    ) -> Result<Self, FormatError> {
         let count = (layout.height as usize).div_ceil(layout.rows());
-        let fields = layout.fields(metadata);
+        let mut fields = layout.fields(metadata);
+        if let Some(position) = position {
+            position.add_to(&mut fields);
+        }
         let strips = vec![&[][..]; count];
         let mut writer = Writer::new();
         fields.iter().for_each(|field| writer.push_field(field));

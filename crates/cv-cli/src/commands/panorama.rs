@@ -30,6 +30,8 @@ const ENDINGS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff", "exr"];
     cv panorama a.jpg b.jpg c.jpg -o pano.png --blend poisson --report out/\n  \
     cv panorama a.jpg b.jpg c.jpg -o pano.png --alpha\n  \
     cv panorama raw16/*.tif -o pano.tif\n  \
+    cv panorama raw16/*.tif -o pano.tif --layers layers/\n  \
+    cv panorama gigapixel/ -o huge.tif --max-memory 4096\n  \
     cv panorama window/*.jpg -o light.exr\n  \
     cv panorama wide/ -o pano.png --camera cam.yaml\n  \
     cv panorama wall/ -o plan.tif --mode plane\n  \
@@ -79,6 +81,10 @@ pub(crate) struct Args {
     /// Crop the result to the largest rectangle without empty pixels.
     #[arg(long)]
     crop: bool,
+    /// Write each warped, exposure-compensated photograph as a TIFF with its seam mask as alpha, for retouching: at its position on the canvas
+    /// (XPosition, YPosition), as GIMP, Photoshop scripts and Hugin read them.
+    #[arg(long, value_name = "DIR")]
+    layers: Option<PathBuf>,
     /// Add an alpha channel, transparent where no photograph reaches; for .png and .tif.
     #[arg(long)]
     alpha: bool,
@@ -154,7 +160,8 @@ impl Args {
 impl Run for Args {
     fn outputs(&self) -> Vec<Output<'_>> {
         let registration = self.save_registration.as_deref().map(|path| Output::File(path, registration::ENDINGS));
-        [Output::File(&self.output, ENDINGS)].into_iter().chain(registration).collect()
+        let layers = self.layers.as_deref().map(Output::Folder);
+        [Output::File(&self.output, ENDINGS)].into_iter().chain(registration).chain(layers).collect()
     }
 
     fn has_no_use_for(&self) -> &'static [Global] {
@@ -178,12 +185,17 @@ impl Run for Args {
         if self.alpha && self.ends_in(&["exr"]) {
             return Err(Failure::usage("--alpha needs a .png or .tif: OpenEXR is written without an alpha channel"));
         }
+        if self.layers.is_some() && (self.blend == BlendMode::Poisson || self.ends_in(&["exr"])) {
+            return Err(Failure::usage("--layers cannot be combined with --blend poisson and .exr outputs")
+                .advice("--blend multiband, and an output as .tif"));
+        }
         let registration = self.registration.as_deref().map(|path| registration::read(path, context)).transpose()?;
         let paths = expand_images(&self.images)?;
         let results: Vec<PathBuf> = [&self.output].into_iter().chain(&self.save_registration).cloned().collect();
         let inputs: Vec<&Path> = paths.iter().chain(&self.registration).map(PathBuf::as_path).collect();
         spare_inputs(&results, &inputs)?;
-        if let Some(bytes) = context.max_memory {
+        // Streamed panoramas have the same pixels, and layers at hand.
+        if let Some(bytes) = context.max_memory.or_else(|| self.layers.as_ref().map(|_| usize::MAX / 4)) {
             return self.stitch_streamed(&paths, registration.as_ref(), bytes, context);
         }
         let pictures = paths.par_iter().map(cv_io::read_image).collect::<Result<Vec<_>, _>>()?;

@@ -54,6 +54,18 @@ pub struct StreamedFrame {
     pub photos: Vec<usize>,
 }
 
+/// A warped and exposure-compensated photograph with its mask.
+#[derive(Debug, Clone)]
+pub struct Layer<T = u8> {
+    /// Index of the photograph.
+    pub photo: usize,
+    /// Its part of the panorama: the bounding box of its mask with the margin of blending.
+    pub bounds: Bounds,
+    /// Red, green, blue, and the mask: white on the side of the seams where this photograph is taken. Outside the mask are the colors of the photograph, beyond
+    /// its border those of the nearest pixel.
+    pub pixels: Image<T, 4>,
+}
+
 /// Receives a panorama row by row.
 pub trait RowSink<T>: Send {
     /// Receives the frame, first of all.
@@ -61,6 +73,20 @@ pub trait RowSink<T>: Send {
     /// # Errors
     /// [`NotWritten`] ends the work.
     fn begin(&mut self, frame: &StreamedFrame) -> Result<(), NotWritten>;
+
+    /// Returns whether [`layer`](Self::layer) shall be called. Default false.
+    fn wants_layers(&self) -> bool {
+        false
+    }
+
+    /// Receives a photograph as it is composited, before the rows and in no particular order; twice one that lies at both ends of a full circle.
+    ///
+    /// # Errors
+    /// [`NotWritten`] ends the work.
+    fn layer(&mut self, layer: Layer<T>) -> Result<(), NotWritten> {
+        let _ = layer;
+        Ok(())
+    }
 
     /// Receives the next rows: colors, and the index of the photograph of each pixel, [`NO_PHOTO`] where none covers it.
     ///
@@ -307,6 +333,9 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     };
     let shown = shown.unwrap_or(Bounds { left: 0, top: 0, right: canvas.0, bottom: canvas.1 });
     output.begin(&frame((shown.width(), shown.height()), alignment))?;
+    if output.wants_layers() {
+        layers(&warped, &labels, shown, &photo_of, output, progress)?;
+    }
     let rows = (budget.work / strip_bytes::<T>(canvas.0).max(1)).max(fewest_rows);
     let strips = blend::Strips { photos: &warped, labels: &labels, typical_side, levels, mode: options.blend, rows };
     strips.blend(shown, &photo_of, output, progress)?;
@@ -328,6 +357,43 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     panorama.map.crop(shown.left, shown.top);
     panorama.canvas.origin += nalgebra::Vector2::new(shown.left as f64, shown.top as f64);
     Ok(panorama)
+}
+
+/// Hands on the layers of the part `shown` of the canvas.
+fn layers<T: PhotoSample>(
+    photos: &WarpedStore<'_, T>,
+    labels: &LabelRows,
+    shown: Bounds,
+    photo_of: &[usize],
+    output: &mut dyn RowSink<T>,
+    progress: &dyn Progress,
+) -> Result<(), RenderError> {
+    let stage = Stage::new(progress, "blend", photo_of.len())?;
+    for (label, bounds) in photos.bounds().into_iter().enumerate() {
+        stage.add(1)?;
+        let Some(bounds) = bounds.and_then(|bounds| bounds.intersection(&shown)) else { continue };
+        let Some(mut photo) = photos.crop(label, bounds)? else { continue };
+        let mut row = vec![NO_PHOTO; bounds.width()];
+        let mut is_used = false;
+        for y in 0..bounds.height() {
+            labels.read_row(bounds.top + y, bounds.left, &mut row);
+            for (pixel, name) in photo.pixels.row_mut(y).as_chunks_mut::<4>().0.iter_mut().zip(&row) {
+                let is_own = usize::from(*name) == label;
+                pixel[3] = if is_own { T::WHITE } else { T::default() };
+                is_used |= is_own;
+            }
+        }
+        if is_used {
+            let bounds = Bounds {
+                left: bounds.left - shown.left,
+                top: bounds.top - shown.top,
+                right: bounds.right - shown.left,
+                bottom: bounds.bottom - shown.top,
+            };
+            output.layer(Layer { photo: photo_of[label], bounds, pixels: photo.pixels })?;
+        }
+    }
+    Ok(())
 }
 
 fn frame(size: (usize, usize), alignment: &Alignment) -> StreamedFrame {

@@ -50,11 +50,12 @@ struct Collected<T> {
     labels: Vec<u16>,
     strips: usize,
     fails_at: usize,
+    layers: Option<Vec<Layer<T>>>,
 }
 
 impl<T> Collected<T> {
     fn failing_at(row: usize) -> Self {
-        Self { size: (0, 0), colors: Vec::new(), labels: Vec::new(), strips: 0, fails_at: row }
+        Self { size: (0, 0), colors: Vec::new(), labels: Vec::new(), strips: 0, fails_at: row, layers: None }
     }
 }
 
@@ -62,6 +63,15 @@ impl<T: PhotoSample> RowSink<T> for Collected<T> {
     fn begin(&mut self, frame: &StreamedFrame) -> Result<(), NotWritten> {
         assert_eq!((frame.reference, &frame.photos[..]), (1, &[0, 1, 2, 3, 4][..]));
         self.size = frame.size;
+        Ok(())
+    }
+
+    fn wants_layers(&self) -> bool {
+        self.layers.is_some()
+    }
+
+    fn layer(&mut self, layer: Layer<T>) -> Result<(), NotWritten> {
+        self.layers.get_or_insert_default().push(layer);
         Ok(())
     }
 
@@ -199,5 +209,32 @@ fn failures_of_source_and_sink_end_the_work() {
             let stop = StopAt::of_stage(stage, at);
             assert_eq!(go(&photos(), usize::MAX, &stop), Err(RenderError::Cancelled(Cancelled)), "{stage} {at}");
         }
+    }
+}
+
+#[test]
+fn layers_put_together_by_their_masks_are_the_panorama_without_blending() {
+    let photos = photos();
+    for crop in [false, true] {
+        let options = CompositingOptions { blend: BlendMode::None, crop, ..CompositingOptions::default() };
+        let limit = MemoryLimit { bytes: 1 << 40, scratch: scratch() };
+        let mut rows = Collected { layers: Some(Vec::new()), ..Collected::failing_at(usize::MAX) };
+        render_streamed(&photos, &alignment(), &options, limit, &mut rows, &cv_core::Silent).unwrap();
+        let mut colors = vec![0; rows.colors.len()];
+        let mut labels = vec![NO_PHOTO; rows.labels.len()];
+        for layer in rows.layers.iter().flatten() {
+            let b = layer.bounds;
+            for (x, y) in (b.top..b.bottom).flat_map(|y| (b.left..b.right).map(move |x| (x, y))) {
+                let [r, g, b, mask] = layer.pixels.at(x - b.left, y - b.top);
+                if mask > 0 {
+                    let i = y * rows.size.0 + x;
+                    // No two masks overlap.
+                    assert_eq!((mask, labels[i]), (255, NO_PHOTO));
+                    labels[i] = layer.photo as u16;
+                    colors[3 * i..][..3].copy_from_slice(&[r, g, b]);
+                }
+            }
+        }
+        assert!(labels == rows.labels && colors == rows.colors, "{crop}");
     }
 }

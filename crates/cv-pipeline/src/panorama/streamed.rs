@@ -6,7 +6,7 @@ use super::{PanoramaError, PanoramaOptions, PanoramaPhoto, PanoramaResult, colle
 use crate::Progress;
 use cv_core::{Camera, Image, ImageView, Stage};
 use cv_panorama::{
-    EightBits, MemoryLimit, NO_PHOTO, NotWritten, PhotoSample, PhotoSource, Registration, RenderError, RowSink,
+    EightBits, Layer, MemoryLimit, NO_PHOTO, NotWritten, PhotoSample, PhotoSource, Registration, RenderError, RowSink,
     StreamError, StreamedFrame, render_streamed,
 };
 use rayon::prelude::*;
@@ -142,11 +142,20 @@ struct Renumbered<'a, T> {
     inputs: &'a [usize],
 }
 
-impl<T> RowSink<T> for Renumbered<'_, T> {
+impl<T: PhotoSample> RowSink<T> for Renumbered<'_, T> {
     fn begin(&mut self, frame: &StreamedFrame) -> Result<(), NotWritten> {
         let mut photos: Vec<usize> = frame.photos.iter().map(|&photo| self.inputs[photo]).collect();
         photos.sort_unstable();
         self.output.begin(&StreamedFrame { size: frame.size, reference: self.inputs[frame.reference], photos })
+    }
+
+    fn wants_layers(&self) -> bool {
+        self.output.wants_layers()
+    }
+
+    fn layer(&mut self, layer: Layer<T>) -> Result<(), NotWritten> {
+        let photo = self.inputs[layer.photo];
+        self.output.layer(Layer { photo, ..layer })
     }
 
     fn rows(&mut self, colors: ImageView<'_, T, 3>, labels: ImageView<'_, u16, 1>) -> Result<(), NotWritten> {

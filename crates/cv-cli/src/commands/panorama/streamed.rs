@@ -4,9 +4,9 @@ use super::{Args, ENDINGS, metadata, outcome, report};
 use crate::frame::{Context, Explain, Failure, Outcome, Output};
 use crate::{rig, words};
 use cv_core::{Image, ImageView, RgbU8};
-use cv_io::{DynImage, FormatError, ImageHeader, IoError, PngPixels, RowWriter};
+use cv_io::{DynImage, ImageHeader, IoError, Metadata, PngPixels, RowWriter};
 use cv_pipeline::panorama_types::{
-    EightBits, MemoryLimit, NO_PHOTO, NotWritten, PhotoSample, PhotoSource, Registration, RenderError, RowSink,
+    EightBits, Layer, MemoryLimit, NO_PHOTO, NotWritten, PhotoSample, PhotoSource, Registration, RenderError, RowSink,
     StreamError, StreamedFrame,
 };
 use cv_pipeline::{PanoramaError, PanoramaPrior, PanoramaResult, panorama_streamed};
@@ -18,6 +18,9 @@ use std::sync::{Mutex, PoisonError};
 
 /// Longer side of the photographs and of the panorama in a report, in pixels, at least where they are larger.
 const REPORT_SIDE: usize = 1600;
+
+/// Rows of a layer that are encoded at a time.
+const LAYER_ROWS: usize = 256;
 
 /// Files that are read when they are needed.
 struct Files<'a, T> {
@@ -50,7 +53,15 @@ struct Rows<'a, 'b, T> {
     writer: Option<&'a mut RowWriter<'b>>,
     headers: &'a [ImageHeader],
     has_alpha: bool,
-    failure: Option<FormatError>,
+    /// Folder of the layers, which exists.
+    layers: Option<&'a Path>,
+    paths: &'a [PathBuf],
+    /// Number of layers of each photograph so far.
+    written: Vec<usize>,
+    size: (usize, usize),
+    failure: Option<IoError>,
+    /// The panorama's path.
+    path: &'a Path,
     thumbnail: Option<Thumbnail<T>>,
 }
 
@@ -91,6 +102,7 @@ where
 {
     fn begin(&mut self, frame: &StreamedFrame) -> Result<(), NotWritten> {
         let (width, height) = frame.size;
+        self.size = frame.size;
         let files: Vec<_> = self.headers.iter().map(|header| &header.metadata).collect();
         if let Some(writer) = &mut self.writer {
             writer.set_metadata(metadata(&files, frame.reference, frame.photos.iter().copied()));
@@ -101,6 +113,33 @@ where
             thumbnail.width = width.div_ceil(thumbnail.step);
         }
         Ok(())
+    }
+
+    fn wants_layers(&self) -> bool {
+        self.layers.is_some()
+    }
+
+    fn layer(&mut self, layer: Layer<T>) -> Result<(), NotWritten> {
+        let Some(folder) = self.layers else { return Ok(()) };
+        let path = folder.join(layer_name(&self.paths[layer.photo], layer.photo, self.written[layer.photo]));
+        self.written[layer.photo] += 1;
+        let icc = self.headers[layer.photo].metadata.icc.clone();
+        let (width, height) = layer.pixels.size();
+        let written = cv_io::write_image_rows(&path, |rows| -> Result<(), IoError> {
+            rows.set_metadata(Metadata { exif: None, icc });
+            rows.set_size(width, height);
+            rows.set_position((layer.bounds.left, layer.bounds.top), self.size);
+            for top in (0..height).step_by(LAYER_ROWS) {
+                if let Some(part) = layer.pixels.view().crop(0, top, width, LAYER_ROWS.min(height - top)) {
+                    rows.write(part).map_err(|reason| IoError { path: path.clone(), writing: true, reason })?;
+                }
+            }
+            Ok(())
+        });
+        written.map_err(|error| {
+            self.failure = Some(error);
+            NotWritten
+        })
     }
 
     fn rows(&mut self, colors: ImageView<'_, T, 3>, labels: ImageView<'_, u16, 1>) -> Result<(), NotWritten> {
@@ -118,11 +157,18 @@ where
         } else {
             writer.write(colors)
         };
-        written.map_err(|error| {
-            self.failure = Some(error);
+        written.map_err(|reason| {
+            self.failure = Some(IoError { path: self.path.to_owned(), writing: true, reason });
             NotWritten
         })
     }
+}
+
+/// Returns the file name of a layer: the index and the name of the photograph; `earlier` layers of it are written.
+fn layer_name(photo: &Path, index: usize, earlier: usize) -> String {
+    let stem = photo.file_stem().unwrap_or_default().to_string_lossy();
+    let again = if earlier == 0 { String::new() } else { format!("-{}", earlier + 1) };
+    format!("{index:03}-{stem}{again}.tif")
 }
 
 impl Args {
@@ -181,15 +227,26 @@ impl Args {
             let limit = MemoryLimit { bytes: max_memory, scratch };
             let thumbnail =
                 has_thumbnail.then(|| Thumbnail { step: 1, width: 0, y: 0, colors: Vec::new(), labels: Vec::new() });
-            let mut rows = Rows { writer, headers, has_alpha: self.alpha, failure: None, thumbnail };
+            let mut rows = Rows {
+                writer,
+                headers,
+                has_alpha: self.alpha,
+                layers: self.layers.as_deref(),
+                paths,
+                written: vec![0; paths.len()],
+                size: (0, 0),
+                failure: None,
+                path,
+                thumbnail,
+            };
             let result = panorama_streamed(files, &priors, registration, &options, limit, &mut rows, context);
             match result {
                 Ok(result) => Ok((result, rows.thumbnail)),
-                Err(error) => Err(self.explained(error, files, rows.failure, path)),
+                Err(error) => Err(explained(error, files, rows.failure)),
             }
         };
         let output = Output::File(&self.output, ENDINGS);
-        let (result, thumbnail): (PanoramaResult<T>, _) = context.write(output, |path| {
+        let write = |path: &Path| {
             if !options.render.radiance {
                 return cv_io::write_image_rows(path, |writer| stitch(path, Some(writer)));
             }
@@ -198,7 +255,11 @@ impl Args {
                 cv_io::write_exr(path, radiance.view())?;
             }
             Ok(made)
-        })?;
+        };
+        let (result, thumbnail): (PanoramaResult<T>, _) = match &self.layers {
+            Some(folder) => context.write(Output::Folder(folder), |_| context.write(output, write))?,
+            None => context.write(output, write)?,
+        };
         self.conclude(paths, &result, context)?;
         context.report(|| {
             let none = || (Image::new(1, 1, [T::default(); 3]), Image::new(1, 1, [NO_PHOTO]));
@@ -212,25 +273,18 @@ impl Args {
         })?;
         Ok(outcome(paths, &result))
     }
+}
 
-    /// Words an error with its cause in the files.
-    fn explained<T>(
-        &self,
-        error: PanoramaError,
-        files: &Files<'_, T>,
-        not_written: Option<FormatError>,
-        path: &Path,
-    ) -> Failure {
-        if let PanoramaError::Render(RenderError::Stream(reason)) = &error {
-            let unread = files.failure.lock().unwrap_or_else(PoisonError::into_inner).take();
-            match (reason, unread, not_written) {
-                (StreamError::Photograph { .. }, Some(error), _) => return error.into(),
-                (StreamError::NotWritten, _, Some(reason)) => {
-                    return IoError { path: path.to_owned(), reason, writing: true }.into();
-                }
-                _ => {}
+/// Words an error with its cause in the files.
+fn explained<T>(error: PanoramaError, files: &Files<'_, T>, not_written: Option<IoError>) -> Failure {
+    if let PanoramaError::Render(RenderError::Stream(reason)) = &error {
+        let unread = files.failure.lock().unwrap_or_else(PoisonError::into_inner).take();
+        match (reason, unread, not_written) {
+            (StreamError::Photograph { .. }, Some(error), _) | (StreamError::NotWritten, _, Some(error)) => {
+                return error.into();
             }
+            _ => {}
         }
-        words::no_panorama(error, files.paths)
     }
+    words::no_panorama(error, files.paths)
 }
