@@ -31,6 +31,9 @@ pub struct CompositingOptions {
     pub exposure: Exposure,
     /// Seam finding. Default [`Seams::GraphCut`].
     pub seams: Seams,
+    /// Where three or more photographs cover a pixel, prefer those near their median, so that objects that move from one to the next vanish; for
+    /// [`Seams::GraphCut`]. Default false.
+    pub removes_transients: bool,
     /// Blending. Default [`BlendMode::Multiband`].
     pub blend: BlendMode,
     /// Interpolation kernel. Default bicubic: a few milliseconds per megapixel more than bilinear, but sharper.
@@ -52,6 +55,7 @@ impl Default for CompositingOptions {
             elastic: true,
             exposure: Exposure::default(),
             seams: Seams::default(),
+            removes_transients: false,
             blend: BlendMode::default(),
             interpolation: Interpolation::Bicubic,
             radiance: false,
@@ -196,7 +200,8 @@ pub(crate) fn draw<T: PhotoSample>(
         preview.correct(&gains, &photo_of);
     }
     clock.lap("exposure");
-    let coarse = seams::on_preview(&preview, &photo_of, options.seams, options.radiance, progress)?;
+    let coarse =
+        seams::on_preview(&preview, &photo_of, options.seams, options.radiance, options.removes_transients, progress)?;
     clock.lap("seams");
 
     let typical_side = layout.typical_side();

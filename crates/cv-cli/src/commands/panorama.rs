@@ -31,6 +31,7 @@ const ENDINGS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff", "exr"];
     cv panorama a.jpg b.jpg c.jpg -o pano.png --alpha\n  \
     cv panorama raw16/*.tif -o pano.tif\n  \
     cv panorama raw16/*.tif -o pano.tif --layers layers/\n  \
+    cv panorama square/ -o empty.png --clean\n  \
     cv panorama gigapixel/ -o huge.tif --max-memory 4096\n  \
     cv panorama window/*.jpg -o light.exr\n  \
     cv panorama wide/ -o pano.png --camera cam.yaml\n  \
@@ -75,6 +76,9 @@ pub(crate) struct Args {
     /// Seam placement: graph cut along small differences, or the Voronoi diagram of the image centers.
     #[arg(long, value_name = "WHERE", value_parser = named::<Seams>(), default_value_t = PanoramaOptions::default().render.seams)]
     seams: Seams,
+    /// Remove what moves: where three or more photographs show a place, prefer those near their median, so that people who walk through vanish.
+    #[arg(long)]
+    clean: bool,
     /// Exposure compensation: none, or match: exposures and white balances, with the camera response and vignetting, estimated jointly in linear intensity.
     #[arg(long, value_name = "WHAT", value_parser = named::<Exposure>(), default_value_t = PanoramaOptions::default().render.exposure)]
     exposure: Exposure,
@@ -145,6 +149,7 @@ impl Args {
         };
         options.render.blend = self.blend;
         options.render.seams = self.seams;
+        options.render.removes_transients = self.clean;
         options.render.exposure = self.exposure;
         options.render.crop = self.crop;
         options.render.radiance = self.ends_in(&["exr"]);
@@ -184,6 +189,10 @@ impl Run for Args {
         }
         if self.alpha && self.ends_in(&["exr"]) {
             return Err(Failure::usage("--alpha needs a .png or .tif: OpenEXR is written without an alpha channel"));
+        }
+        if self.clean && self.seams == Seams::Voronoi {
+            return Err(Failure::usage("--clean has no effect with --seams voronoi, which ignores the content")
+                .advice("--seams graphcut"));
         }
         if self.layers.is_some() && (self.blend == BlendMode::Poisson || self.ends_in(&["exr"])) {
             return Err(Failure::usage("--layers cannot be combined with --blend poisson and .exr outputs")

@@ -7,6 +7,7 @@
 mod alpha_expansion;
 mod cost;
 mod misalignment;
+mod transient;
 mod upsample;
 mod windows;
 
@@ -20,6 +21,7 @@ use alpha_expansion::Labeling;
 use cost::difference;
 use cv_core::{Cancelled, Image, Progress, Stage, named};
 use misalignment::Misalignments;
+use transient::transient_costs;
 
 /// Seam finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -72,6 +74,7 @@ pub(crate) fn on_preview(
     photo_of: &[usize],
     seams: Seams,
     radiance: bool,
+    removes_transients: bool,
     progress: &dyn Progress,
 ) -> Result<Image<u16, 1>, Cancelled> {
     let clipped = if radiance { CLIPPED_RADIANCE_COST } else { CLIPPED_COST };
@@ -95,7 +98,11 @@ pub(crate) fn on_preview(
         four.into_iter().map(|(i, j)| differ(a, b, 2 * x + i, 2 * y + j)).fold(0, i32::max)
     };
     // A pixel represents four, a unit of seam length two.
-    let pixel = |label: usize, x: usize, y: usize| (2.0 * data_term(&half.pieces[label], clipped, x, y)) as i32;
+    let half_transients = removes_transients.then(|| transient_costs(&half));
+    let pixel = |label: usize, x: usize, y: usize| {
+        let transient = transient_at(half_transients.as_deref(), &half, label, x, y);
+        (2.0 * (data_term(&half.pieces[label], clipped, x, y) + transient)) as i32
+    };
     let reach: Vec<_> = half.pieces.iter().map(|p| Some(&p.warped)).collect();
     // Further rounds hardly lower the energy.
     let labeling = Labeling { photos: &reach, unary: pixel, difference: max_difference, free: |_, _| true };
@@ -113,7 +120,11 @@ pub(crate) fn on_preview(
         }
     }
     let near = seam_band(&labels, BAND_RADIUS, &stage)?;
-    let pixel = |label: usize, x: usize, y: usize| data_term(&preview.pieces[label], clipped, x, y) as i32;
+    let transients = removes_transients.then(|| transient_costs(preview));
+    let pixel = |label: usize, x: usize, y: usize| {
+        let transient = transient_at(transients.as_deref(), preview, label, x, y);
+        (data_term(&preview.pieces[label], clipped, x, y) + transient) as i32
+    };
     let labeling =
         Labeling { photos: &pieces, unary: pixel, difference: differ, free: |x: usize, y: usize| near[y * width + x] };
     labeling.expand(&mut labels, 1, &stage)?;
@@ -136,6 +147,12 @@ fn data_term(piece: &Piece, clipped: f32, x: usize, y: usize) -> f32 {
     let b = piece.warped.bounds;
     let i = (y - b.top) * b.width() + x - b.left;
     ECCENTRICITY_COST * piece.eccentricity[i] + if piece.clipped[i] { clipped } else { 0.0 }
+}
+
+/// Returns the cost of [`transient_costs`] of a pixel, 0 without them.
+fn transient_at(costs: Option<&[Vec<f32>]>, preview: &Preview, label: usize, x: usize, y: usize) -> f32 {
+    let b = preview.pieces[label].warped.bounds;
+    costs.map_or(0.0, |costs| costs[label][(y - b.top) * b.width() + x - b.left])
 }
 
 fn eccentricity(piece: &Piece, x: usize, y: usize) -> f32 {
@@ -365,7 +382,7 @@ mod tests {
 
     #[test]
     fn voronoi_takes_the_photograph_whose_middle_is_nearest() {
-        let labels = on_preview(&preview(), &[0, 1], Seams::Voronoi, false, &Silent).unwrap();
+        let labels = on_preview(&preview(), &[0, 1], Seams::Voronoi, false, false, &Silent).unwrap();
         for (x, y) in (0..SIZE.1).flat_map(|y| (0..SIZE.0).map(move |x| (x, y))) {
             // Both are 120 wide: half-way between columns 60 and 100.
             assert_eq!(labels.at(x, y)[0], u16::from(x >= 80), "{x} {y}");
@@ -375,8 +392,8 @@ mod tests {
     #[test]
     fn a_graph_cut_runs_around_what_the_photographs_show_at_two_places() {
         let preview = preview();
-        let straight = on_preview(&preview, &[0, 1], Seams::Voronoi, false, &Silent).unwrap();
-        let cut = on_preview(&preview, &[0, 1], Seams::GraphCut, false, &Silent).unwrap();
+        let straight = on_preview(&preview, &[0, 1], Seams::Voronoi, false, false, &Silent).unwrap();
+        let cut = on_preview(&preview, &[0, 1], Seams::GraphCut, false, false, &Silent).unwrap();
         assert!(misfit(&straight, &preview) > 10_000, "{}", misfit(&straight, &preview));
         // Around the pole both show the same: nothing is cut.
         assert_eq!(misfit(&cut, &preview), 0);

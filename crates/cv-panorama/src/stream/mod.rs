@@ -188,8 +188,8 @@ const BASE_BYTES: usize = 192 << 20;
 /// Returns the name of what needs the whole canvas in memory, and the bytes per canvas pixel, measured with photographs of 8 bits that overlap by a third.
 fn needs_whole(options: &CompositingOptions) -> Option<(&'static str, usize)> {
     match options.blend {
-        _ if options.radiance => Some(("radiance", 80)),
-        BlendMode::Poisson => Some(("poisson blending", 100)),
+        _ if options.radiance => Some(("radiance", 65)),
+        BlendMode::Poisson => Some(("poisson blending", 80)),
         BlendMode::Multiband | BlendMode::Feather | BlendMode::None => None,
     }
 }
@@ -296,7 +296,8 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
         preview.correct(&gains, &photo_of);
     }
     clock.lap("exposure");
-    let coarse = seams::on_preview(&preview, &photo_of, options.seams, options.radiance, progress)?;
+    let coarse =
+        seams::on_preview(&preview, &photo_of, options.seams, options.radiance, options.removes_transients, progress)?;
     let step = preview.step;
     drop(preview);
     clock.lap("seams");
