@@ -227,3 +227,67 @@ pub fn write_image_rows<R, E: From<IoError>>(
         (None, Ok(())) => Err(IoError::writing(path, FormatError::Empty).into()),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{read_image, write_image};
+    use cv_core::Image;
+
+    #[test]
+    fn files_are_those_of_the_whole_image_and_absent_after_a_failure() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        let colors = Image::<u8, 3>::from_fn(701, 333, |x, y| [(x % 251) as u8, (y % 241) as u8, (x * y % 239) as u8]);
+        let deep = colors.map(|p| p.map(|v| 257 * u16::from(v) + 3));
+        let alpha = colors.map(|[r, g, b]| [r, g, b, r / 128 * 255]);
+        // Strips of any height.
+        macro_rules! in_rows {
+            ($name:expr, $image:expr) => {
+                write_image_rows(path($name), |rows| -> Result<(), IoError> {
+                    let (w, h) = $image.size();
+                    rows.set_size(w, h);
+                    for top in (0..h).step_by(50) {
+                        let part = $image.view().crop(0, top, w, 50.min(h - top)).unwrap();
+                        rows.write(part).map_err(|reason| IoError::writing(Path::new($name), reason))?;
+                    }
+                    Ok(())
+                })
+            };
+        }
+        macro_rules! compare {
+            ($ending:expr, $image:expr) => {
+                in_rows!(concat!("rows.", $ending), $image).unwrap();
+                write_image(path(concat!("whole.", $ending)), $image.view(), &Metadata::default()).unwrap();
+                let (a, b) = (path(concat!("rows.", $ending)), path(concat!("whole.", $ending)));
+                assert_eq!(read_image(&a).unwrap().pixels, read_image(&b).unwrap().pixels, $ending);
+                // PNG is compressed in another way.
+                assert!($ending == "png" || std::fs::read(a).unwrap() == std::fs::read(b).unwrap(), $ending);
+            };
+        }
+        compare!("png", colors);
+        compare!("tif", colors);
+        compare!("jpg", colors);
+        compare!("png", deep);
+        compare!("tif", deep);
+        compare!("tif", alpha);
+        let tiny = Image::<u8, 3>::new(1, 1, [7, 8, 9]);
+        compare!("tif", tiny);
+        compare!("png", tiny);
+        let error = in_rows!("deep.jpg", deep).unwrap_err();
+        assert!(matches!(error.reason, FormatError::NotRepresentable { format: "JPEG", .. }), "{error}");
+        let short = write_image_rows(path("short.png"), |rows| -> Result<(), IoError> {
+            rows.set_size(701, 334);
+            rows.write(colors.view()).map_err(|reason| IoError::writing(Path::new("short.png"), reason))
+        });
+        assert!(short.unwrap_err().to_string().contains("1 rows are missing"));
+        for (size, rows) in [((700, 333), "width"), ((701, 300), "height")] {
+            let wrong = write_image_rows(path("wrong.tif"), |writer| -> Result<(), IoError> {
+                writer.set_size(size.0, size.1);
+                writer.write(colors.view()).map_err(|reason| IoError::writing(Path::new("wrong.tif"), reason))
+            });
+            assert!(matches!(wrong.unwrap_err().reason, FormatError::Corrupt { .. }), "{rows}");
+        }
+        assert!(["deep.jpg", "short.png", "wrong.tif"].iter().all(|name| !path(name).exists()));
+    }
+}

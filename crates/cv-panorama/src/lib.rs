@@ -56,5 +56,7 @@ pub use photometric::{Exposure, Gains};
 pub use registration::{Pto, PtoError, Registration, RegistrationError};
 pub use render::{CompositingOptions, Panorama, RenderError, render, render_with};
 pub use seams::Seams;
-pub use stream::{Layer, MemoryLimit, NotWritten, PhotoSource, RowSink, StreamError, StreamedFrame, render_streamed};
+pub use stream::{
+    Layer, MemoryLimit, NotWritten, PhotoSource, RowSink, ScratchFile, StreamError, StreamedFrame, render_streamed,
+};
 pub use surface::{Bounds, Canvas, Framing, LayoutError, PhotoMap, Projection, WarpedPhoto};

@@ -5,6 +5,7 @@
 //! are handed on. The pixels are the same as those of [`render`](crate::render).
 
 mod blend;
+mod budget;
 mod label_rows;
 mod scratch;
 
@@ -13,19 +14,20 @@ pub(crate) use scratch::WarpedStore;
 
 use crate::align::Alignment;
 use crate::bit_depth::PhotoSample;
-use crate::blend::{BlendMode, NO_PHOTO};
+use crate::blend::NO_PHOTO;
 use crate::photometric::{Exposure, Gains, estimate_gains};
 use crate::render::{CompositingOptions, Drawing, PREVIEW_PIXELS, Panorama, RenderError, check, draw, regions};
 use crate::seams::{self, Seams};
 use crate::surface::{
-    Bounds, Layout, PhotoMap, Placement, Preview, PreviewScale, ROUND_UNITS, WarpedPhoto, displacements_with,
-    downsample_box, largest_rectangle_of, layout,
+    Bounds, Layout, PhotoMap, Preview, PreviewScale, ROUND_UNITS, WarpedPhoto, displacements_with, downsample_box,
+    largest_rectangle_of, layout,
 };
+use budget::{Budget, needs_whole, strip_bytes};
 use cv_core::{Image, ImageView, Mask, Progress, RgbU8, Stage, StageClock};
 use rayon::prelude::*;
 use scratch::{GrayStore, Scratch};
 use std::borrow::Cow;
-use std::fs::File;
+use std::io::{Read, Seek, Write};
 
 /// Photographs that are loaded when they are needed.
 pub trait PhotoSource<T>: Sync
@@ -95,13 +97,17 @@ pub trait RowSink<T>: Send {
     fn rows(&mut self, colors: ImageView<'_, T, 3>, labels: ImageView<'_, u16, 1>) -> Result<(), NotWritten>;
 }
 
+/// A file that is written and read at any place.
+pub trait ScratchFile: Read + Write + Seek + Send {}
+
+impl<F: Read + Write + Seek + Send> ScratchFile for F {}
+
 /// Memory for [`render_streamed`].
-#[derive(Debug)]
 pub struct MemoryLimit {
     /// Bytes of memory, at most.
     pub bytes: usize,
     /// An empty file for what does not fit: a byte per pixel of the photographs first, then about five bytes per pixel of the panorama (ten for 16 bits).
-    pub scratch: File,
+    pub scratch: Box<dyn ScratchFile>,
 }
 
 /// Why streamed compositing failed.
@@ -182,70 +188,6 @@ pub fn render_streamed<T: PhotoSample>(
     T::draw_streamed(photos, alignment, options, limit, output, progress)
 }
 
-/// Bytes that are not counted: the program, the registration, and what the allocator keeps.
-const BASE_BYTES: usize = 192 << 20;
-
-/// Returns the name of what needs the whole canvas in memory, and the bytes per canvas pixel, measured with photographs of 8 bits that overlap by a third.
-fn needs_whole(options: &CompositingOptions) -> Option<(&'static str, usize)> {
-    match options.blend {
-        _ if options.radiance => Some(("radiance", 65)),
-        BlendMode::Poisson => Some(("poisson blending", 80)),
-        BlendMode::Multiband | BlendMode::Feather | BlendMode::None => None,
-    }
-}
-
-/// Shares of the memory, in bytes.
-struct Budget {
-    /// For each phase: grays in memory, windows of seams, or a strip.
-    work: usize,
-    /// Photographs that are loaded at a time.
-    loads: usize,
-}
-
-impl Budget {
-    fn new<T: PhotoSample>(
-        layout: &Layout,
-        regions: &[Bounds],
-        options: &CompositingOptions,
-        fewest_rows: usize,
-        allowed: usize,
-    ) -> Result<Self, StreamError> {
-        let (width, height) = (layout.width, layout.height);
-        let samples = size_of::<T>();
-        let pixels = |p: &Placement| p.view.camera.width * p.view.camera.height;
-        if let Some((what, per_pixel)) = needs_whole(options) {
-            let photos: usize = layout.placements.iter().map(|p| 3 * samples * pixels(p)).sum();
-            let needed = BASE_BYTES + photos + width * height * samples * per_pixel;
-            if needed > allowed {
-                return Err(StreamError::Whole { what, width, height, needed, allowed });
-            }
-            return Ok(Self { work: allowed, loads: 1 });
-        }
-        let photo = layout.placements.iter().map(pixels).max().unwrap_or(0);
-        let region = regions.iter().map(|b| b.width() * b.height()).max().unwrap_or(0);
-        // Kept throughout: the coarse levels of the pyramid, the labels of the blocks of the seams, twice, and their band.
-        let kept = BASE_BYTES + width * height * 2 / 5;
-        // The file, the decoder's output and the copy of 8 bits; the warped photograph, and its pyramid while it is added.
-        let load = photo * (4 * samples + 1);
-        let one = load + region * 4 * samples;
-        let pyramid = region * (4 * samples + 2 + 8);
-        let strip = strip_bytes::<T>(width) * fewest_rows;
-        let window = if options.seams == Seams::GraphCut { seams::window_memory::<T>(region) } else { 0 };
-        let needed = kept + one.max(pyramid).max(strip).max(window);
-        if needed > allowed {
-            return Err(StreamError::Memory { width, height, needed, allowed });
-        }
-        let work = allowed - kept;
-        Ok(Self { work, loads: (work / 2 / load.max(1)).clamp(1, rayon::current_num_threads()) })
-    }
-}
-
-/// Returns the memory in bytes per row of a strip: warped photographs that overlap by up to a half, their half resolution, the fine levels, colors and labels
-/// of this strip and of the one that is being written.
-fn strip_bytes<T>(width: usize) -> usize {
-    width * (2 * 4 * size_of::<T>() + 4 * 3 * size_of::<T>() + 2 * 4 + 8 + 8)
-}
-
 /// Implements [`render_streamed`].
 pub(crate) fn draw_streamed<T: PhotoSample>(
     photos: &dyn PhotoSource<T>,
@@ -283,7 +225,7 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
         };
         (fields, small)
     };
-    scratch.clear()?;
+    scratch.clear();
     clock.lap("elastic");
     let mut preview = {
         let stage = Stage::new(progress, "preview", layout.placements.len())?;

@@ -1,26 +1,25 @@
 //! A scratch file for what does not fit in memory: gray images and warped photographs.
 
-use super::StreamError;
+use super::{ScratchFile, StreamError};
 use crate::bit_depth::Internals;
 use crate::surface::{Bounds, WarpedPhoto};
 use cv_core::{GrayU8, Image};
-use std::fs::File;
-use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::io::{self, SeekFrom};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// A file to which images are appended, and from which parts are read, from any thread.
-pub(crate) struct Scratch(Mutex<(File, u64)>);
+pub(crate) struct Scratch(Mutex<(Box<dyn ScratchFile>, u64)>);
 
 fn failed(error: &io::Error) -> StreamError {
     StreamError::Scratch { os_error: error.raw_os_error() }
 }
 
 impl Scratch {
-    pub(crate) fn new(file: File) -> Self {
+    pub(crate) fn new(file: Box<dyn ScratchFile>) -> Self {
         Self(Mutex::new((file, 0)))
     }
 
-    fn lock(&self) -> MutexGuard<'_, (File, u64)> {
+    fn lock(&self) -> MutexGuard<'_, (Box<dyn ScratchFile>, u64)> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -35,7 +34,7 @@ impl Scratch {
         Ok(at)
     }
 
-    /// Reads `count` rows of `out`'s length over it, `stride` bytes apart, from position `at`.
+    /// Fills `out` with rows of `row` bytes that begin `stride` bytes apart, from position `at`.
     fn read_rows(&self, at: u64, stride: usize, row: usize, out: &mut [u8]) -> Result<(), StreamError> {
         let mut locked = self.lock();
         let file = &mut locked.0;
@@ -54,10 +53,8 @@ impl Scratch {
     }
 
     /// Discards what was appended.
-    pub(crate) fn clear(&self) -> Result<(), StreamError> {
-        let mut locked = self.lock();
-        locked.1 = 0;
-        locked.0.set_len(0).map_err(|error| failed(&error))
+    pub(crate) fn clear(&self) {
+        self.lock().1 = 0;
     }
 }
 

@@ -1,5 +1,6 @@
 use super::*;
 use crate::align::{CameraMotion, View};
+use crate::blend::BlendMode;
 use crate::render::render;
 use crate::testing::{StopAt, deep_photograph, photograph, sky};
 use cv_core::{Camera, Cancelled, Vector3};
@@ -85,14 +86,8 @@ impl<T: PhotoSample> RowSink<T> for Collected<T> {
     }
 }
 
-fn scratch() -> File {
-    // An unnamed file: removed at once, usable until it is closed.
-    static NUMBER: std::sync::atomic::AtomicUsize = std::sync::atomic::AtomicUsize::new(0);
-    let number = NUMBER.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
-    let path = std::env::temp_dir().join(format!("cv-panorama-{}-{number}", std::process::id()));
-    let file = File::options().read(true).write(true).create_new(true).open(&path).unwrap();
-    drop(std::fs::remove_file(&path));
-    file
+fn scratch() -> Box<dyn ScratchFile> {
+    Box::new(std::io::Cursor::new(Vec::new()))
 }
 
 /// The smallest limit with which the panorama is made.

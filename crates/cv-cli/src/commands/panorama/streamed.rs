@@ -224,7 +224,7 @@ impl Args {
             let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
             let scratch = tempfile::tempfile_in(folder)
                 .during(format!("cannot create a scratch file in {}", folder.display()))?;
-            let limit = MemoryLimit { bytes: max_memory, scratch };
+            let limit = MemoryLimit { bytes: max_memory, scratch: Box::new(scratch) };
             let thumbnail =
                 has_thumbnail.then(|| Thumbnail { step: 1, width: 0, y: 0, colors: Vec::new(), labels: Vec::new() });
             let mut rows = Rows {
