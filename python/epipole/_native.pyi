@@ -397,6 +397,7 @@ def panorama(
     roll: float | None = 0.0,
     blend: Literal["multiband", "poisson", "feather", "none"] | None = "multiband",
     seams: Literal["graphcut", "voronoi"] | None = "graphcut",
+    clean: bool | None = False,
     exposure: Literal["none", "match"] | None = "match",
     crop: bool | None = False,
     scale: float | None = 1.0,

@@ -5,7 +5,7 @@ pub(crate) mod many_views;
 
 use crate::frame::Failure;
 use cv_io::FormatError;
-use cv_pipeline::panorama_types::{LayoutError, RegistrationError, RenderError};
+use cv_pipeline::panorama_types::{LayoutError, RegistrationError, RenderError, StreamError};
 use cv_pipeline::stereo::RectifyError;
 use cv_pipeline::{
     Advice, DenseError, DepthError, LeftOut, MatchingError, NoPairCause, PanoramaError, ReconstructError,
@@ -182,6 +182,24 @@ pub(crate) fn no_panorama(error: PanoramaError, paths: &[PathBuf]) -> Failure {
             let photograph = photograph.map(|path| format!("{}: ", path.display())).unwrap_or_default();
             Failure::new(format!("{photograph}{source}"))
                 .advice("give photographs of the same cameras in the order of the registration")
+        }
+        PanoramaError::Render(RenderError::Stream(source)) => {
+            let mib = |bytes: usize| bytes.div_ceil(1 << 20);
+            let advice = match source {
+                StreamError::Memory { needed, .. } => format!("--max-memory {}, or a smaller --scale", mib(needed)),
+                StreamError::Whole { what: "radiance", needed, .. } => {
+                    format!("--max-memory {}, a smaller --scale, or a panorama as .tif of 16 bits", mib(needed))
+                }
+                StreamError::Whole { needed, .. } => {
+                    format!("--blend multiband, --max-memory {}, or a smaller --scale", mib(needed))
+                }
+                StreamError::Scratch { .. } | StreamError::NotWritten => {
+                    "free some space on the disk of the panorama: five times its pixels in bytes, ten times for 16 bits"
+                        .to_owned()
+                }
+                StreamError::Photograph { .. } => "do not change the photographs during the run".to_owned(),
+            };
+            Failure::new(source).advice(advice)
         }
         PanoramaError::Render(source) => {
             let advice = match source {

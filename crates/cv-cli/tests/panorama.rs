@@ -427,3 +427,99 @@ fn a_hugin_project_has_the_views_and_is_read_as_a_registration() {
         Some(2)
     );
 }
+
+/// Photographs of 16 bits too; at once and in strips, in every format that is written row by row.
+#[test]
+fn a_limit_of_memory_changes_no_pixel() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, names) = landscape(folder.path(), 3, 0.5);
+    let deep = cv_io::read_rgb(folder.path().join(&names[0])).unwrap().map(|p| p.map(|v| 257 * u16::from(v)));
+    cv_io::write_png(folder.path().join("deep.png"), deep.view()).unwrap();
+    let set = [&names[0], &names[1], &names[2]].map(String::as_str);
+    let with_deep = ["deep.png", set[1], set[2]];
+    let made = |photos: &[&str], output: &str, more: &[&str]| {
+        let args: Vec<&str> = ["panorama"].iter().chain(photos).chain(&["-o", output]).chain(more).copied().collect();
+        let value = json(folder.path(), &args);
+        (cv_io::read_image(folder.path().join(output)).unwrap(), value)
+    };
+    for (output, photos, more) in [
+        ("a.tif", &set, &["--projection", "cylindrical"][..]),
+        ("b.png", &set, &["--alpha", "--blend", "feather"][..]),
+        ("c.jpg", &set, &["--crop", "--blend", "none", "--seams", "voronoi"][..]),
+        ("d.tif", &with_deep, &["--scale", "1.7"][..]),
+        ("e.png", &with_deep, &["--alpha", "--blend", "poisson"][..]),
+    ] {
+        let (whole, told) = made(photos, output, more);
+        let (limited, also) = made(photos, output, &[more, &["--max-memory", "300"]].concat());
+        assert!(whole.pixels == limited.pixels, "{output}");
+        for key in ["size", "bits", "images", "projection", "reprojection_rms_px"] {
+            assert_eq!(told[key], also[key], "{output} {key}");
+        }
+    }
+    // Alpha is dropped when read.
+    let bytes = std::fs::read(folder.path().join("b.png")).unwrap();
+    let reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
+    assert_eq!(reader.output_color_type(), (png::ColorType::Rgba, png::BitDepth::Eight));
+    // The report is drawn from thumbnails, and nothing is left beside the outputs.
+    let more = ["--max-memory", "300", "--report", "report"];
+    made(&set, "f.tif", &more);
+    assert!(std::fs::read_to_string(folder.path().join("report/report.html")).unwrap().contains("<img"));
+    let left = std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name());
+    assert!(left.into_iter().all(|name| !name.to_string_lossy().starts_with('.')));
+}
+
+#[test]
+fn a_panorama_that_does_not_fit_is_refused_with_numbers_and_a_remedy() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, names) = landscape(folder.path(), 2, 0.0);
+    let args = |more: &[&'static str]| [&["panorama", &names[0], &names[1], "-o", "p.png"][..], more].concat();
+    let ran = run(folder.path(), &args(&["--max-memory", "100"]));
+    assert!(ran.code == Some(1) && ran.stderr.contains("100 MiB are allowed"), "{ran:?}");
+    assert!(ran.stderr.contains("try: --max-memory") && ran.stderr.contains("a smaller --scale"), "{ran:?}");
+    let ran = run(folder.path(), &args(&["--max-memory", "100", "--blend", "poisson"]));
+    assert!(ran.code == Some(1) && ran.stderr.contains("try: --blend multiband, --max-memory"), "{ran:?}");
+    assert!(!folder.path().join("p.png").exists());
+}
+
+/// Size and pixels of a PNG with alpha.
+fn with_alpha(bytes: &[u8]) -> (usize, usize, Vec<u8>) {
+    let mut reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
+    let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+    let info = reader.next_frame(&mut pixels).unwrap();
+    (info.width as usize, info.height as usize, pixels)
+}
+
+#[test]
+fn layers_put_together_are_the_panorama_without_blending() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, names) = landscape(folder.path(), 3, 0.5);
+    let args = ["panorama", &names[0], &names[1], &names[2], "-o", "p.png", "--blend", "none", "--alpha"];
+    done(folder.path(), &[&args[..], &["--layers", "layers"]].concat());
+    let whole = with_alpha(&std::fs::read(folder.path().join("p.png")).unwrap());
+    let (width, height, expected) = whole;
+    let mut composite = vec![0_u8; expected.len()];
+    for (i, name) in names.iter().enumerate() {
+        let stem = Path::new(name).file_stem().unwrap().to_str().unwrap();
+        let bytes = std::fs::read(folder.path().join(format!("layers/{i:03}-{stem}.tif"))).unwrap();
+        let mut decoder = tiff::decoder::Decoder::new(std::io::Cursor::new(&bytes)).unwrap();
+        // In inches, at 150 pixels per inch.
+        let [left, top] = [286, 287].map(|tag| match decoder.get_tag(tiff::tags::Tag::Unknown(tag)).unwrap() {
+            tiff::decoder::ifd::Value::Rational(pixels, 150) => pixels,
+            other => panic!("{other:?}"),
+        });
+        let canvas = [33300, 33301].map(|tag| decoder.get_tag_u32(tiff::tags::Tag::Unknown(tag)).unwrap());
+        assert_eq!(canvas, [width as u32, height as u32]);
+        let (w, h) = decoder.dimensions().unwrap();
+        let tiff::decoder::DecodingResult::U8(pixels) = decoder.read_image().unwrap() else { panic!("not bytes") };
+        for (j, pixel) in pixels.chunks_exact(4).enumerate().filter(|(_, pixel)| pixel[3] > 0) {
+            let (x, y) = (left as usize + j % w as usize, top as usize + j / w as usize);
+            assert!(x < width && y < height && h > 0);
+            let place = &mut composite[4 * (y * width + x)..][..4];
+            assert_eq!((pixel[3], place[3]), (255, 0), "masks overlap");
+            place.copy_from_slice(pixel);
+        }
+    }
+    assert!(composite == expected);
+    let usage = [&args[..6], &["--layers", "layers", "--blend", "poisson"]].concat();
+    assert_eq!(run(folder.path(), &usage).code, Some(2));
+}

@@ -1,5 +1,6 @@
 //! Encoding images as PNG, JPEG and TIFF.
 
+use std::io::Write;
 use std::path::Path;
 
 use cv_core::ImageView;
@@ -11,7 +12,7 @@ use crate::files::write_bytes;
 use crate::{FormatError, IoError, Metadata};
 
 /// Width, height, color type, bit depth, and the samples row-major, big-endian, without padding.
-type Parts = (usize, usize, ColorType, BitDepth, Vec<u8>);
+pub(crate) type Parts = (usize, usize, ColorType, BitDepth, Vec<u8>);
 
 /// Image types that can be written as PNG: views of 1, 3 or 4 channels of `u8` or `u16`, and masks.
 pub trait PngPixels: sealed::Sealed {
@@ -64,22 +65,33 @@ fn encode_png_parts(
         return Err(FormatError::NotRepresentable { format: "PNG", what: format!("an image of {width}×{height}") });
     };
     let mut bytes = Vec::new();
-    let mut info = png::Info::with_size(w, h);
-    info.exif_metadata = metadata.exif_for(w, h).map(Into::into);
+    let fail = |e: png::EncodingError| FormatError::corrupt("PNG", e.to_string());
+    let mut write = || png_writer(&mut bytes, (w, h), (color, depth), metadata, dpi)?.write_image_data(&pixels);
+    write().map_err(fail)?;
+    Ok(bytes)
+}
+
+/// Writes the header of a PNG.
+pub(crate) fn png_writer<W: Write>(
+    sink: W,
+    (width, height): (u32, u32),
+    (color, depth): (ColorType, BitDepth),
+    metadata: &Metadata,
+    dpi: Option<f64>,
+) -> Result<png::Writer<W>, png::EncodingError> {
+    let mut info = png::Info::with_size(width, height);
+    info.exif_metadata = metadata.exif_for(width, height).map(Into::into);
     info.icc_profile = metadata.icc_for(color.samples()).map(Into::into);
     info.pixel_dims = dpi.map(|dpi| {
         let per_meter = (dpi / 0.0254).round() as u32;
         png::PixelDimensions { xppu: per_meter, yppu: per_meter, unit: png::Unit::Meter }
     });
-    let fail = |e: png::EncodingError| FormatError::corrupt("PNG", e.to_string());
-    let mut encoder = png::Encoder::with_info(&mut bytes, info).map_err(fail)?;
+    let mut encoder = png::Encoder::with_info(sink, info)?;
     encoder.set_color(color);
     encoder.set_depth(depth);
     encoder.set_compression(Compression::Fast);
     encoder.set_filter(Filter::Adaptive);
-    let write = || encoder.write_header()?.write_image_data(&pixels);
-    write().map_err(fail)?;
-    Ok(bytes)
+    encoder.write_header()
 }
 
 /// Writes a PNG; masks as 0 and 255.
@@ -134,7 +146,26 @@ fn encode_jpeg_parts(
     };
     let channels = color.samples();
     let mut bytes = Vec::new();
-    let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, quality.clamp(1, 100));
+    encode_jpeg_rows(
+        &mut bytes,
+        JpegRows { width: w, height: h, channels, pixels: &pixels },
+        channels,
+        quality,
+        metadata,
+    )?;
+    Ok(bytes)
+}
+
+/// Encodes a JPEG whose rows are requested from `image`, from the top.
+pub(crate) fn encode_jpeg_rows<W: Write>(
+    sink: W,
+    image: impl jpeg_encoder::ImageBuffer,
+    channels: usize,
+    quality: u8,
+    metadata: &Metadata,
+) -> Result<(), FormatError> {
+    let (w, h) = (image.width(), image.height());
+    let mut encoder = jpeg_encoder::Encoder::new(sink, quality.clamp(1, 100));
     let fail = |e: jpeg_encoder::EncodingError| FormatError::corrupt("JPEG", e.to_string());
     let exif = metadata.exif_for(w.into(), h.into()).map(|block| [&b"Exif\0\0"[..], &block].concat());
     // The maximum of a segment; EXIF blocks without thumbnail are far smaller.
@@ -144,8 +175,7 @@ fn encode_jpeg_parts(
     if let Some(profile) = metadata.icc_for(channels) {
         encoder.add_icc_profile(profile).map_err(fail)?;
     }
-    encoder.encode_image(JpegRows { width: w, height: h, channels, pixels: &pixels }).map_err(fail)?;
-    Ok(bytes)
+    encoder.encode_image(image).map_err(fail)
 }
 
 /// Pixels for the encoder. (Its own `encode` would be compiled for nine pixel types.)
@@ -173,22 +203,26 @@ impl jpeg_encoder::ImageBuffer for JpegRows<'_> {
     fn fill_buffers(&self, y: u16, buffers: &mut [Vec<u8>; 4]) {
         let row = self.channels * usize::from(self.width);
         let row = &self.pixels[usize::from(y) * row..][..row];
-        let [luma, blue, red, _] = buffers;
         if self.channels == 1 {
-            luma.extend_from_slice(row);
+            buffers[0].extend_from_slice(row);
         } else {
-            for &[r, g, b] in row.as_chunks().0 {
-                let ycc = jpeg_encoder::rgb_to_ycbcr(r, g, b);
-                luma.push(ycc.0);
-                blue.push(ycc.1);
-                red.push(ycc.2);
-            }
+            push_ycbcr(row, buffers);
         }
     }
 }
 
+/// Appends a row of RGB pixels in the encoder's color space.
+pub(crate) fn push_ycbcr(row: &[u8], [luma, blue, red, _]: &mut [Vec<u8>; 4]) {
+    for &[r, g, b] in row.as_chunks().0 {
+        let ycc = jpeg_encoder::rgb_to_ycbcr(r, g, b);
+        luma.push(ycc.0);
+        blue.push(ycc.1);
+        red.push(ycc.2);
+    }
+}
+
 /// Quality of JPEG files, 1 to 100.
-const JPEG_QUALITY: u8 = 95;
+pub(crate) const JPEG_QUALITY: u8 = 95;
 
 /// Writes a JPEG at quality 95.
 ///

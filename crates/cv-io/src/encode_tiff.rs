@@ -4,7 +4,7 @@
 use crate::{FormatError, Metadata};
 use exif::experimental::Writer;
 use exif::{Context, Field, In, Tag, Value};
-use std::io::Cursor;
+use std::io::{Cursor, Seek, SeekFrom, Write};
 
 /// Approximate bytes of a strip before compression.
 const STRIP_BYTES: usize = 1 << 18;
@@ -28,56 +28,228 @@ pub(crate) struct Samples<'a> {
 /// [`FormatError::NotRepresentable`] for an empty image, and for more bytes than 32-bit offsets can address.
 pub(crate) fn encode_samples(samples: &Samples<'_>, metadata: &Metadata) -> Result<Vec<u8>, FormatError> {
     let Samples { width, height, channels, depth, bytes } = *samples;
-    let side = |n: usize| u32::try_from(n).ok().filter(|&n| n > 0);
-    let (Some(w), Some(h)) = (side(width), side(height)) else {
-        return Err(FormatError::NotRepresentable { format: "TIFF", what: format!("an image of {width}×{height}") });
-    };
-    let row = width * channels * depth;
-    let rows = (STRIP_BYTES / row).clamp(1, height);
-    let mut strips = Vec::with_capacity(height.div_ceil(rows));
-    let mut plain = Vec::with_capacity(rows * row);
-    for strip in bytes.chunks(rows * row) {
-        plain.clear();
-        plain.extend_from_slice(strip);
-        plain
-            .chunks_exact_mut(row)
-            .for_each(|row| if depth == 1 { difference_u8(row, channels) } else { difference_u16(row, channels) });
-        strips.push(miniz_oxide::deflate::compress_to_vec_zlib(&plain, COMPRESSION_LEVEL));
-    }
-    // Fields take far less than a tenth.
-    if strips.iter().map(Vec::len).sum::<usize>() as u64 > u64::from(u32::MAX) / 10 * 9 {
-        return Err(FormatError::NotRepresentable { format: "TIFF", what: "more than 4 GB".to_owned() });
-    }
-    let numbers = |tag: Tag, values: &[u16]| Field { tag, ifd_num: In::PRIMARY, value: Value::Short(values.to_vec()) };
-    let number = |tag: Tag, value: u32| Field { tag, ifd_num: In::PRIMARY, value: Value::Long(vec![value]) };
-    let mut fields = metadata.tiff_fields(w, h);
-    fields.extend([
-        number(Tag::ImageWidth, w),
-        number(Tag::ImageLength, h),
-        numbers(Tag::BitsPerSample, &vec![8 * depth as u16; channels]),
-        numbers(Tag::Compression, &[8]),
-        numbers(Tag::PhotometricInterpretation, &[if channels == 1 { 1 } else { 2 }]),
-        numbers(Tag::SamplesPerPixel, &[channels as u16]),
-        number(Tag::RowsPerStrip, rows as u32),
-        numbers(Tag::PlanarConfiguration, &[1]),
-        // Horizontal differencing.
-        numbers(Tag(Context::Tiff, 317), &[2]),
-    ]);
-    if channels == 4 {
-        // Unassociated alpha.
-        fields.push(numbers(Tag(Context::Tiff, 338), &[2]));
-    }
-    if let Some(profile) = metadata.icc_for(channels) {
-        let value = Value::Undefined(profile.to_vec(), 0);
-        fields.push(Field { tag: Tag(Context::Tiff, 34675), ifd_num: In::PRIMARY, value });
-    }
-    let strips: Vec<&[u8]> = strips.iter().map(Vec::as_slice).collect();
-    let mut writer = Writer::new();
-    fields.iter().for_each(|field| writer.push_field(field));
-    writer.set_strips(&strips, In::PRIMARY);
+    let layout = TiffLayout::new(width, height, channels, depth)?;
     let mut file = Cursor::new(Vec::new());
-    writer.write(&mut file, true).map_err(|e| FormatError::corrupt("TIFF", e.to_string()))?;
+    let mut writer = TiffWriter::new(&mut file, layout, metadata, None)?;
+    writer.write(bytes)?;
+    writer.finish()?;
     Ok(file.into_inner())
+}
+
+/// Size and sample format of a TIFF file.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct TiffLayout {
+    width: u32,
+    height: u32,
+    channels: usize,
+    /// Bytes per sample: 1 or 2.
+    depth: usize,
+}
+
+impl TiffLayout {
+    /// # Errors
+    /// [`FormatError::NotRepresentable`] for an empty image.
+    pub(crate) fn new(width: usize, height: usize, channels: usize, depth: usize) -> Result<Self, FormatError> {
+        let side = |n: usize| u32::try_from(n).ok().filter(|&n| n > 0);
+        match (side(width), side(height)) {
+            (Some(width), Some(height)) => Ok(Self { width, height, channels, depth }),
+            _ => Err(FormatError::NotRepresentable { format: "TIFF", what: format!("an image of {width}×{height}") }),
+        }
+    }
+
+    /// Bytes of a row before compression.
+    fn row(&self) -> usize {
+        self.width as usize * self.channels * self.depth
+    }
+
+    /// Rows of a strip.
+    fn rows(&self) -> usize {
+        (STRIP_BYTES / self.row()).clamp(1, self.height as usize)
+    }
+
+    fn fields(&self, metadata: &Metadata) -> Vec<Field> {
+        let Self { width, height, channels, depth } = *self;
+        let numbers =
+            |tag: Tag, values: &[u16]| Field { tag, ifd_num: In::PRIMARY, value: Value::Short(values.to_vec()) };
+        let number = |tag: Tag, value: u32| Field { tag, ifd_num: In::PRIMARY, value: Value::Long(vec![value]) };
+        let mut fields = metadata.tiff_fields(width, height);
+        fields.extend([
+            number(Tag::ImageWidth, width),
+            number(Tag::ImageLength, height),
+            numbers(Tag::BitsPerSample, &vec![8 * depth as u16; channels]),
+            numbers(Tag::Compression, &[8]),
+            numbers(Tag::PhotometricInterpretation, &[if channels == 1 { 1 } else { 2 }]),
+            numbers(Tag::SamplesPerPixel, &[channels as u16]),
+            number(Tag::RowsPerStrip, self.rows() as u32),
+            numbers(Tag::PlanarConfiguration, &[1]),
+            // Horizontal differencing.
+            numbers(Tag(Context::Tiff, 317), &[2]),
+        ]);
+        if channels == 4 {
+            // Unassociated alpha.
+            fields.push(numbers(Tag(Context::Tiff, 338), &[2]));
+        }
+        if let Some(profile) = metadata.icc_for(channels) {
+            let value = Value::Undefined(profile.to_vec(), 0);
+            fields.push(Field { tag: Tag(Context::Tiff, 34675), ifd_num: In::PRIMARY, value });
+        }
+        fields
+    }
+}
+
+/// Position of an image in a larger canvas, in pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct TiffPosition {
+    pub(crate) left: u32,
+    pub(crate) top: u32,
+    /// Size of the canvas.
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+}
+
+/// Pixels per inch of files with a position, which is stored in inches.
+const POSITION_DPI: u32 = 150;
+
+impl TiffPosition {
+    fn add_to(self, fields: &mut Vec<Field>) {
+        let resolution = [Tag::XResolution, Tag::YResolution, Tag::ResolutionUnit];
+        fields.retain(|field| !resolution.contains(&field.tag));
+        let ratio = |tag: Tag, num: u32, denom: u32| {
+            let value = Value::Rational(vec![exif::Rational { num, denom }]);
+            Field { tag, ifd_num: In::PRIMARY, value }
+        };
+        let number = |tag: u16, value: u32| Field {
+            tag: Tag(Context::Tiff, tag),
+            ifd_num: In::PRIMARY,
+            value: Value::Long(vec![value]),
+        };
+        fields.extend([
+            ratio(Tag::XResolution, POSITION_DPI, 1),
+            ratio(Tag::YResolution, POSITION_DPI, 1),
+            Field { tag: Tag::ResolutionUnit, ifd_num: In::PRIMARY, value: Value::Short(vec![2]) },
+            // XPosition and YPosition.
+            ratio(Tag(Context::Tiff, 286), self.left, POSITION_DPI),
+            ratio(Tag(Context::Tiff, 287), self.top, POSITION_DPI),
+            // ImageFullWidth and ImageFullLength, as Hugin and PTGui write them.
+            number(33300, self.width),
+            number(33301, self.height),
+        ]);
+    }
+}
+
+/// Writes a TIFF file by rows: the fields first, with places for the positions of the strips, which are written at the end.
+pub(crate) struct TiffWriter<W> {
+    sink: W,
+    layout: TiffLayout,
+    /// Rows of the next strip, before compression.
+    pending: Vec<u8>,
+    /// Bytes of each strip in the file.
+    strips: Vec<u32>,
+    /// Number of strips of the whole image.
+    count: usize,
+    /// Position of the first strip, and of the arrays of offsets and of byte counts.
+    places: [u64; 3],
+}
+
+impl<W: Write + Seek> TiffWriter<W> {
+    /// Writes the fields.
+    ///
+    /// # Errors
+    /// [`FormatError::Os`].
+    pub(crate) fn new(
+        mut sink: W,
+        layout: TiffLayout,
+        metadata: &Metadata,
+        position: Option<TiffPosition>,
+    ) -> Result<Self, FormatError> {
+        let count = (layout.height as usize).div_ceil(layout.rows());
+        let mut fields = layout.fields(metadata);
+        if let Some(position) = position {
+            position.add_to(&mut fields);
+        }
+        let strips = vec![&[][..]; count];
+        let mut writer = Writer::new();
+        fields.iter().for_each(|field| writer.push_field(field));
+        writer.set_strips(&strips, In::PRIMARY);
+        let mut head = Cursor::new(Vec::new());
+        writer.write(&mut head, true).map_err(|e| FormatError::corrupt("TIFF", e.to_string()))?;
+        let head = head.into_inner();
+        let place = |tag| value_position(&head, tag).ok_or_else(|| FormatError::corrupt("TIFF", "no strips"));
+        let places = [head.len() as u64, place(273)?, place(279)?];
+        sink.write_all(&head)?;
+        Ok(Self { sink, layout, pending: Vec::new(), strips: Vec::with_capacity(count), count, places })
+    }
+
+    /// Writes the next rows: big-endian samples without padding.
+    ///
+    /// # Errors
+    /// [`FormatError::NotRepresentable`] for more bytes than 32-bit offsets can address, and [`FormatError::Os`].
+    pub(crate) fn write(&mut self, rows: &[u8]) -> Result<(), FormatError> {
+        let strip = self.layout.rows() * self.layout.row();
+        let mut rest = rows;
+        while !rest.is_empty() {
+            let (part, after) = rest.split_at(rest.len().min(strip - self.pending.len()));
+            self.pending.extend_from_slice(part);
+            rest = after;
+            if self.pending.len() == strip {
+                self.write_strip()?;
+            }
+        }
+        Ok(())
+    }
+
+    fn write_strip(&mut self) -> Result<(), FormatError> {
+        let TiffLayout { channels, depth, .. } = self.layout;
+        for row in self.pending.chunks_exact_mut(self.layout.row()) {
+            if depth == 1 { difference_u8(row, channels) } else { difference_u16(row, channels) }
+        }
+        let strip = miniz_oxide::deflate::compress_to_vec_zlib(&self.pending, COMPRESSION_LEVEL);
+        self.pending.clear();
+        self.strips.push(strip.len() as u32);
+        let bytes: u64 = self.strips.iter().map(|n| u64::from(*n)).sum();
+        if bytes + self.places[0] > u64::from(u32::MAX) {
+            return Err(FormatError::NotRepresentable { format: "TIFF", what: "more than 4 GB".to_owned() });
+        }
+        Ok(self.sink.write_all(&strip)?)
+    }
+
+    /// Writes the last strip and the positions of all.
+    ///
+    /// # Errors
+    /// [`FormatError::Os`]; [`FormatError::Corrupt`] where rows are missing.
+    pub(crate) fn finish(mut self) -> Result<(), FormatError> {
+        if !self.pending.is_empty() {
+            self.write_strip()?;
+        }
+        if self.strips.len() != self.count {
+            return Err(FormatError::corrupt("TIFF", format!("{} of {} strips", self.strips.len(), self.count)));
+        }
+        let [first, offsets, counts] = self.places;
+        let mut at = first as u32;
+        let starts = self.strips.iter().map(|n| {
+            let start = at;
+            at += n;
+            start
+        });
+        let starts: Vec<u8> = starts.flat_map(u32::to_le_bytes).collect();
+        let lengths: Vec<u8> = self.strips.iter().flat_map(|n| n.to_le_bytes()).collect();
+        for (place, bytes) in [(offsets, starts), (counts, lengths)] {
+            self.sink.seek(SeekFrom::Start(place))?;
+            self.sink.write_all(&bytes)?;
+        }
+        Ok(self.sink.flush()?)
+    }
+}
+
+/// Returns the position of the values of a field of 32-bit numbers in the first directory of a little-endian TIFF.
+fn value_position(head: &[u8], tag: u16) -> Option<u64> {
+    let u16_at = |i: usize| Some(u16::from_le_bytes(*head.get(i..i + 2)?.first_chunk()?));
+    let u32_at = |i: usize| Some(u32::from_le_bytes(*head.get(i..i + 4)?.first_chunk()?));
+    let directory = u32_at(4)? as usize;
+    let entries = (0..usize::from(u16_at(directory)?)).map(|i| directory + 2 + 12 * i);
+    let entry = entries.into_iter().find(|&at| u16_at(at) == Some(tag))?;
+    // One value of four bytes is in the entry itself.
+    if u32_at(entry + 4)? == 1 { Some(entry as u64 + 8) } else { u32_at(entry + 8).map(u64::from) }
 }
 
 /// Applies horizontal differencing to 8-bit samples.

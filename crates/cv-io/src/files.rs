@@ -70,13 +70,18 @@ pub fn write_atomic<R: Into<FormatError>>(
 ) -> Result<(), IoError> {
     let path = path.as_ref();
     let mut content = Some(content);
-    let mut once = |sink: &mut dyn Write| content.take().map_or(Ok(()), |content| content(sink).map_err(Into::into));
-    write_atomic_inner(path, &mut once).map_err(|reason| IoError::writing(path, reason))
+    let mut once = |file: File| {
+        let mut sink = BufWriter::with_capacity(1 << 18, file);
+        content.take().map_or(Ok(()), |content| content(&mut sink).map_err(Into::into))?;
+        Ok(sink.flush()?)
+    };
+    write_atomic_file(path, &mut once).map_err(|reason| IoError::writing(path, reason))
 }
 
-fn write_atomic_inner(
+/// As [`write_atomic`]; `content` writes to the file and closes it.
+pub(crate) fn write_atomic_file(
     path: &Path,
-    content: &mut dyn FnMut(&mut dyn Write) -> Result<(), FormatError>,
+    content: &mut dyn FnMut(File) -> Result<(), FormatError>,
 ) -> Result<(), FormatError> {
     let target: PathBuf = if path.is_symlink() { fs::canonicalize(path)? } else { path.to_owned() };
     let existing = fs::metadata(&target).ok();
@@ -85,9 +90,7 @@ fn write_atomic_inner(
             return Err(io::Error::new(io::ErrorKind::IsADirectory, "it is a folder").into());
         }
         if !metadata.is_file() {
-            let mut sink = BufWriter::new(File::options().write(true).open(&target)?);
-            content(&mut sink)?;
-            return Ok(sink.flush()?);
+            return content(File::options().write(true).open(&target)?);
         }
     }
     let folder = match target.parent() {
@@ -106,11 +109,8 @@ fn write_atomic_inner(
         use std::os::unix::fs::PermissionsExt;
         builder.permissions(fs::Permissions::from_mode(0o666));
     }
-    let (pending, mut temporary) = PendingWrite::make(|| builder.tempfile_in(folder), |made| made.path())?;
-    let mut sink = BufWriter::with_capacity(1 << 18, temporary.as_file_mut());
-    content(&mut sink)?;
-    sink.flush()?;
-    drop(sink);
+    let (pending, temporary) = PendingWrite::make(|| builder.tempfile_in(folder), |made| made.path())?;
+    content(temporary.as_file().try_clone()?)?;
     if let Some(metadata) = existing {
         temporary.as_file().set_permissions(metadata.permissions())?;
     }

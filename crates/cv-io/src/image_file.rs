@@ -296,11 +296,49 @@ pub fn read_image_info(path: impl AsRef<Path>) -> Result<((usize, usize), ExifIn
     decode_info(&bytes).map_err(|reason| IoError::reading(path, reason))
 }
 
-fn decode_info(bytes: &[u8]) -> Result<((usize, usize), ExifInfo), FormatError> {
+/// What the header of an image file says.
+#[derive(Debug, Clone)]
+pub struct ImageHeader {
+    /// Width and height in pixels, after orientation.
+    pub size: (usize, usize),
+    /// EXIF information.
+    pub exif: ExifInfo,
+    /// EXIF block and color profile.
+    pub metadata: Metadata,
+    /// Bytes per sample: 1, 2 or 4.
+    pub depth: usize,
+    /// Peak memory in bytes to decode it to an 8-bit color image.
+    pub memory: u64,
+}
+
+/// Reads the header of an image file, without decoding its pixels.
+///
+/// # Errors
+/// As [`read_image`].
+pub fn read_image_header(path: impl AsRef<Path>) -> Result<ImageHeader, IoError> {
+    let path = path.as_ref();
+    let bytes = read_bytes(path)?;
+    let (mut header, exif) = decode_header(&bytes).map_err(|reason| IoError::reading(path, reason))?;
+    let is_turned = exif.orientation >= 5;
+    Ok(ImageHeader {
+        size: if is_turned { (header.height, header.width) } else { (header.width, header.height) },
+        metadata: Metadata { exif: header.exif.take(), icc: header.icc.take() },
+        depth: header.depth,
+        memory: header.memory(bytes.len(), is_turned),
+        exif,
+    })
+}
+
+fn decode_header(bytes: &[u8]) -> Result<(Header, ExifInfo), FormatError> {
     let format = format_detection::image_format(bytes)?;
     let header = catch_unwind(AssertUnwindSafe(|| format.header(bytes)))
         .unwrap_or_else(|_| Err(FormatError::corrupt(format.name(), "the decoder failed")))?;
     let exif = exif_info(&header);
+    Ok((header, exif))
+}
+
+fn decode_info(bytes: &[u8]) -> Result<((usize, usize), ExifInfo), FormatError> {
+    let (header, exif) = decode_header(bytes)?;
     let (width, height) = (header.width, header.height);
     Ok((if exif.orientation >= 5 { (height, width) } else { (width, height) }, exif))
 }

@@ -40,6 +40,7 @@ pub mod colmap;
 mod depth_png;
 mod encode;
 mod encode_exr;
+mod encode_rows;
 mod encode_tiff;
 mod error;
 mod exif_info;
@@ -72,6 +73,7 @@ pub use encode::{
     write_png_to_print, write_png_with,
 };
 pub use encode_exr::{encode_exr, write_exr};
+pub use encode_rows::{RowWriter, write_image_rows};
 pub use error::{FormatError, IoError};
 pub use exif_info::{ExifFocal, ExifGps, ExifInfo, FocalSource};
 pub use features::{
@@ -80,8 +82,8 @@ pub use features::{
 };
 pub use files::{MAX_FILE_BYTES, read_bytes, write_atomic, write_bytes};
 pub use image_file::{
-    DEFAULT_MAX_PIXELS, DynImage, Pixels, ReadOptions, decode_image, read_gray_u8, read_image, read_image_info,
-    read_image_with, read_mask, read_rgb,
+    DEFAULT_MAX_PIXELS, DynImage, ImageHeader, Pixels, ReadOptions, decode_image, read_gray_u8, read_image,
+    read_image_header, read_image_info, read_image_with, read_mask, read_rgb,
 };
 pub use maps::{decode_map, read_map};
 pub use matches::{Matches, parse_matches, read_matches, write_matches};

@@ -7,6 +7,7 @@ use crate::align::Alignment;
 use crate::blend::{BlendMode, Blender, of_mode};
 use crate::render::{CompositingOptions, Panorama, RenderError, draw};
 use crate::rows::for_each_row;
+use crate::stream::{MemoryLimit, PhotoSource, RowSink, draw_streamed};
 use crate::surface::{WarpedPhoto, downsample_box};
 use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Stage};
 use cv_imgproc::{Pixel, bicubic_at, bicubic_rgb_at, resize_area};
@@ -65,7 +66,30 @@ pub trait Internals: Channel {
         stage: &Stage<'_>,
     ) -> Result<Cow<'a, [Option<WarpedPhoto>]>, Cancelled>;
 
+    /// As [`Internals::drawn_in_8_bits`], of one photograph.
+    fn warped_in_8_bits(photo: WarpedPhoto<Self>, stage: &Stage<'_>) -> Result<Option<WarpedPhoto>, Cancelled> {
+        let mut copies = Self::drawn_in_8_bits(&[Some(photo)], stage)?.into_owned();
+        Ok(copies.pop().flatten())
+    }
+
     fn blender(mode: BlendMode) -> &'static dyn Blender<Self>
+    where
+        Self: PhotoSample;
+
+    /// Returns the samples as bytes, for [`Internals::fill_from_bytes`] of the same process.
+    fn bytes_of(samples: &[Self]) -> Cow<'_, [u8]>;
+
+    /// Fills samples from the bytes that `read` writes.
+    fn fill_from_bytes<E>(samples: &mut [Self], read: impl FnOnce(&mut [u8]) -> Result<(), E>) -> Result<(), E>;
+
+    fn draw_streamed(
+        photos: &dyn PhotoSource<Self>,
+        alignment: &Alignment,
+        options: &CompositingOptions,
+        limit: MemoryLimit,
+        output: &mut dyn RowSink<Self>,
+        progress: &dyn Progress,
+    ) -> Result<Panorama<Self>, RenderError>
     where
         Self: PhotoSample;
 
@@ -142,6 +166,30 @@ impl Internals for u8 {
         _: &Stage<'_>,
     ) -> Result<Cow<'a, [Option<WarpedPhoto>]>, Cancelled> {
         Ok(Cow::Borrowed(photos))
+    }
+
+    fn warped_in_8_bits(photo: WarpedPhoto, _: &Stage<'_>) -> Result<Option<WarpedPhoto>, Cancelled> {
+        Ok(Some(photo))
+    }
+
+    #[inline(never)]
+    fn draw_streamed(
+        photos: &dyn PhotoSource<Self>,
+        alignment: &Alignment,
+        options: &CompositingOptions,
+        limit: MemoryLimit,
+        output: &mut dyn RowSink<Self>,
+        progress: &dyn Progress,
+    ) -> Result<Panorama<Self>, RenderError> {
+        draw_streamed(photos, alignment, options, limit, output, progress)
+    }
+
+    fn bytes_of(samples: &[Self]) -> Cow<'_, [u8]> {
+        Cow::Borrowed(samples)
+    }
+
+    fn fill_from_bytes<E>(samples: &mut [Self], read: impl FnOnce(&mut [u8]) -> Result<(), E>) -> Result<(), E> {
+        read(samples)
     }
 
     #[inline(never)]
@@ -228,6 +276,29 @@ impl Internals for u16 {
             Ok(WarpedPhoto { bounds: photo.bounds, pixels })
         };
         photos.iter().map(|photo| photo.as_ref().map(copy).transpose()).collect::<Result<_, _>>().map(Cow::Owned)
+    }
+
+    #[inline(never)]
+    fn draw_streamed(
+        photos: &dyn PhotoSource<Self>,
+        alignment: &Alignment,
+        options: &CompositingOptions,
+        limit: MemoryLimit,
+        output: &mut dyn RowSink<Self>,
+        progress: &dyn Progress,
+    ) -> Result<Panorama<Self>, RenderError> {
+        draw_streamed(photos, alignment, options, limit, output, progress)
+    }
+
+    fn bytes_of(samples: &[Self]) -> Cow<'_, [u8]> {
+        Cow::Owned(samples.iter().flat_map(|v| v.to_ne_bytes()).collect())
+    }
+
+    fn fill_from_bytes<E>(samples: &mut [Self], read: impl FnOnce(&mut [u8]) -> Result<(), E>) -> Result<(), E> {
+        let mut bytes = vec![0; 2 * samples.len()];
+        read(&mut bytes)?;
+        samples.iter_mut().zip(bytes.as_chunks::<2>().0).for_each(|(v, b)| *v = u16::from_ne_bytes(*b));
+        Ok(())
     }
 
     #[inline(never)]

@@ -40,6 +40,7 @@ mod registration;
 mod render;
 mod rows;
 mod seams;
+mod stream;
 mod surface;
 #[cfg(test)]
 mod testing;
@@ -55,4 +56,7 @@ pub use photometric::{Exposure, Gains};
 pub use registration::{Pto, PtoError, Registration, RegistrationError};
 pub use render::{CompositingOptions, Panorama, RenderError, render, render_with};
 pub use seams::Seams;
+pub use stream::{
+    Layer, MemoryLimit, NotWritten, PhotoSource, RowSink, ScratchFile, StreamError, StreamedFrame, render_streamed,
+};
 pub use surface::{Bounds, Canvas, Framing, LayoutError, PhotoMap, Projection, WarpedPhoto};

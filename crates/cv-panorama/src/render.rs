@@ -4,10 +4,11 @@ use crate::align::Alignment;
 use crate::bit_depth::{Channel, EightBits, PhotoSample};
 use crate::blend::{BlendMode, Blender, Composition, NO_PHOTO, of_mode};
 use crate::photometric::{
-    Exposure, ExposureCorrection, Gains, decode_radiance, estimate_gains, fill_saturated, relative_gains,
+    Exposure, ExposureCorrection, Gains, Tone, decode_radiance, estimate_gains, fill_saturated, relative_gains,
 };
 use crate::rows::for_each_row;
 use crate::seams::{self, Seams, label_bounds};
+use crate::stream::StreamError;
 use crate::surface::{
     Bounds, Canvas, DisplacementField, Framing, Layout, LayoutError, PhotoMap, Placement, Preview, Projection,
     WarpSettings, WarpedPhoto, displacements, downsampled_view, largest_rectangle, layout, warp,
@@ -30,6 +31,9 @@ pub struct CompositingOptions {
     pub exposure: Exposure,
     /// Seam finding. Default [`Seams::GraphCut`].
     pub seams: Seams,
+    /// Where three or more photographs cover a pixel, prefer those near their median, so that objects that move from one to the next vanish; for
+    /// [`Seams::GraphCut`]. Default false.
+    pub removes_transients: bool,
     /// Blending. Default [`BlendMode::Multiband`].
     pub blend: BlendMode,
     /// Interpolation kernel. Default bicubic: a few milliseconds per megapixel more than bilinear, but sharper.
@@ -51,6 +55,7 @@ impl Default for CompositingOptions {
             elastic: true,
             exposure: Exposure::default(),
             seams: Seams::default(),
+            removes_transients: false,
             blend: BlendMode::default(),
             interpolation: Interpolation::Bicubic,
             radiance: false,
@@ -93,6 +98,9 @@ pub enum RenderError {
         /// Height of the canvas.
         expected_height: usize,
     },
+    /// Streamed compositing failed ([`render_streamed`](crate::render_streamed)).
+    #[error(transparent)]
+    Stream(#[from] StreamError),
     /// The work was stopped by its progress callback.
     #[error(transparent)]
     Cancelled(#[from] Cancelled),
@@ -104,7 +112,10 @@ pub enum RenderError {
 /// A panorama.
 #[derive(Debug, Clone)]
 pub struct Panorama<T = u8> {
-    /// The image, of the bit depth of the photographs; black where no photograph covers it.
+    /// Width and height in pixels.
+    pub size: (usize, usize),
+    /// The image, of the bit depth of the photographs; black where no photograph covers it. As `mask` and `labels`, empty where the panorama was
+    /// [streamed](crate::render_streamed).
     pub image: Image<T, 3>,
     /// Linear scene radiance, if requested by [`CompositingOptions::radiance`]: not tone-mapped, in the primaries of the photographs; 1 is white at the center of the reference photograph.
     /// Pixels clipped in every photograph are lower bounds. With [`Exposure::None`] each photograph keeps its exposure. 0 where no photograph covers it.
@@ -128,7 +139,7 @@ pub struct Panorama<T = u8> {
 }
 
 /// Number of pixels of the preview on which seams are found.
-const PREVIEW_PIXELS: usize = 300_000;
+pub(crate) const PREVIEW_PIXELS: usize = 300_000;
 
 /// Composites the panorama.
 ///
@@ -170,7 +181,7 @@ pub(crate) fn draw<T: PhotoSample>(
     progress: &dyn Progress,
 ) -> Result<Panorama<T>, RenderError> {
     let mut clock = StageClock::new();
-    check(photos, alignment, options)?;
+    check(|index| photos.get(index).map_or((0, 0), ImageView::size), alignment, options)?;
     let layout = layout(alignment, options.projection, &options.framing, options.resolution, options.max_pixels)?;
     let photo_of: Vec<usize> = layout.placements.iter().map(|p| p.photo).collect();
     let eight = EightBits::new(photos, "elastic", progress)?;
@@ -189,15 +200,16 @@ pub(crate) fn draw<T: PhotoSample>(
         preview.correct(&gains, &photo_of);
     }
     clock.lap("exposure");
-    let coarse = seams::on_preview(&preview, &photo_of, options.seams, options.radiance, progress)?;
+    let coarse =
+        seams::on_preview(&preview, &photo_of, options.seams, options.radiance, options.removes_transients, progress)?;
     clock.lap("seams");
 
     let typical_side = layout.typical_side();
     // No canvas has more levels.
     let levels = blender.pyramid_levels(typical_side).min(16);
     let regions = regions(&coarse, preview.step, &layout, levels);
-    let drawing = Drawing { photos, layout: &layout, regions: &regions, fields: &fields, options };
-    let warped = drawing.warped(&gains, progress)?;
+    let drawing = Drawing { layout: &layout, regions: &regions, fields: &fields, options };
+    let warped = drawing.warped(photos, &gains, progress)?;
     clock.lap("warp");
     let mut labels = {
         let stage = Stage::new(progress, "seams", 1)?;
@@ -218,7 +230,7 @@ pub(crate) fn draw<T: PhotoSample>(
     let radiance = if options.radiance {
         drop(warped);
         let relative = relative_gains(&gains, alignment.reference);
-        let radiance = drawing.radiance(&relative, progress)?;
+        let radiance = drawing.radiance(photos, &relative, progress)?;
         let composition = Composition { photos: &radiance, labels: &labels, typical_side };
         let mut radiance = of_mode::<f32>(options.blend).blend(&composition, progress)?;
         // Blending may overshoot below zero.
@@ -238,6 +250,7 @@ pub(crate) fn draw<T: PhotoSample>(
     })?;
     stage.add(1)?;
     let mut panorama = Panorama {
+        size: image.size(),
         image,
         radiance,
         mask,
@@ -259,8 +272,8 @@ pub(crate) fn draw<T: PhotoSample>(
 }
 
 /// Checks the sizes of the photographs and the options.
-fn check<T: Sample>(
-    photos: &[ImageView<'_, T, 3>],
+pub(crate) fn check(
+    size_of_photo: impl Fn(usize) -> (usize, usize),
     alignment: &Alignment,
     options: &CompositingOptions,
 ) -> Result<(), RenderError> {
@@ -268,7 +281,7 @@ fn check<T: Sample>(
     options.framing.check()?;
     for (index, view) in alignment.used() {
         let (expected_width, expected_height) = (view.camera.width, view.camera.height);
-        let (width, height) = photos.get(index).map_or((0, 0), ImageView::size);
+        let (width, height) = size_of_photo(index);
         if (width, height) != (expected_width, expected_height) {
             return Err(RenderError::WrongPhoto { index, width, height, expected_width, expected_height });
         }
@@ -277,7 +290,7 @@ fn check<T: Sample>(
 }
 
 /// Returns the region of the canvas on which each placement is warped: the bounding box of its label, and the margin of a pyramid of `levels` levels.
-fn regions(coarse: &Image<u16, 1>, step: usize, layout: &Layout, levels: usize) -> Vec<Option<Bounds>> {
+pub(crate) fn regions(coarse: &Image<u16, 1>, step: usize, layout: &Layout, levels: usize) -> Vec<Option<Bounds>> {
     let (w, h) = (layout.width, layout.height);
     // One preview pixel for upsampling, two for the refinement of the seams.
     let slack = 3 * step;
@@ -294,51 +307,74 @@ fn regions(coarse: &Image<u16, 1>, step: usize, layout: &Layout, levels: usize) 
 }
 
 /// Inputs of warping.
-struct Drawing<'a, T> {
-    photos: &'a [ImageView<'a, T, 3>],
-    layout: &'a Layout,
-    regions: &'a [Option<Bounds>],
-    fields: &'a [Option<DisplacementField>],
-    options: &'a CompositingOptions,
+pub(crate) struct Drawing<'a> {
+    pub(crate) layout: &'a Layout,
+    pub(crate) regions: &'a [Option<Bounds>],
+    pub(crate) fields: &'a [Option<DisplacementField>],
+    pub(crate) options: &'a CompositingOptions,
 }
 
-impl<T: PhotoSample> Drawing<'_, T> {
+impl Drawing<'_> {
     /// Returns the factor of the box filter that is applied before warping against aliasing.
     fn shrink(&self) -> usize {
         ((1.0 / self.options.resolution).floor() as usize).max(1)
     }
 
     /// Warps every placement to its region.
-    fn warped(&self, gains: &Gains, progress: &dyn Progress) -> Result<Vec<Option<WarpedPhoto<T>>>, Cancelled> {
+    fn warped<T: PhotoSample>(
+        &self,
+        photos: &[ImageView<'_, T, 3>],
+        gains: &Gains,
+        progress: &dyn Progress,
+    ) -> Result<Vec<Option<WarpedPhoto<T>>>, Cancelled> {
         let stage = Stage::new(progress, "warp", self.layout.placements.len())?;
-        let (shrink, tone) = (self.shrink(), gains.tone(T::PARTS));
-        let evened = self.options.exposure != Exposure::None;
-        let draw = |placement: &Placement, region: Bounds, field: Option<&DisplacementField>| {
-            let photo = self.photos[placement.photo];
-            let correction = evened.then(|| ExposureCorrection::new(&tone, gains, placement.photo));
-            if shrink == 1 {
-                return self.warp(photo, placement, region, field, correction, &stage);
-            }
-            let small = T::shrunk(photo, shrink, &stage)?;
-            self.warp(small.view(), placement, region, field, correction, &stage)
+        let tone = gains.tone(T::PARTS);
+        let draw = |k: usize, region: Bounds| {
+            self.warped_one(photos[self.layout.placements[k].photo], k, region, gains, &tone, &stage)
         };
         self.each(draw, &stage)
     }
 
+    /// Warps a photograph to the region of placement `k`.
+    pub(crate) fn warped_one<T: PhotoSample>(
+        &self,
+        photo: ImageView<'_, T, 3>,
+        k: usize,
+        region: Bounds,
+        gains: &Gains,
+        tone: &Tone,
+        stage: &Stage<'_>,
+    ) -> Result<WarpedPhoto<T>, Cancelled> {
+        let is_corrected = self.options.exposure != Exposure::None;
+        let correction = is_corrected.then(|| ExposureCorrection::new(tone, gains, self.layout.placements[k].photo));
+        let shrink = self.shrink();
+        if shrink == 1 {
+            return self.warp(photo, k, region, correction, stage);
+        }
+        let small = T::shrunk(photo, shrink, stage)?;
+        self.warp(small.view(), k, region, correction, stage)
+    }
+
     /// Warps the linear radiance of every placement to its region; clipped pixels are filled from the others.
-    fn radiance(&self, gains: &Gains, progress: &dyn Progress) -> Result<Vec<Option<WarpedPhoto<f32>>>, Cancelled> {
+    fn radiance<T: PhotoSample>(
+        &self,
+        photos: &[ImageView<'_, T, 3>],
+        gains: &Gains,
+        progress: &dyn Progress,
+    ) -> Result<Vec<Option<WarpedPhoto<f32>>>, Cancelled> {
         let stage = Stage::new(progress, "radiance", self.layout.placements.len() + 1)?;
         let (shrink, tone) = (self.shrink(), gains.tone(1));
-        let draw = |placement: &Placement, region: Bounds, field: Option<&DisplacementField>| {
-            let photo = decode_radiance(self.photos[placement.photo], gains, &stage)?;
-            let correction = Some(ExposureCorrection::new(&tone, gains, placement.photo));
+        let draw = |k: usize, region: Bounds| {
+            let index = self.layout.placements[k].photo;
+            let photo = decode_radiance(photos[index], gains, &stage)?;
+            let correction = Some(ExposureCorrection::new(&tone, gains, index));
             let size = ((photo.width() / shrink).max(1), (photo.height() / shrink).max(1));
             // Incomplete blocks are dropped.
             let whole =
                 photo.view().crop(0, 0, (size.0 * shrink).min(photo.width()), (size.1 * shrink).min(photo.height()));
             match whole.filter(|_| shrink > 1).and_then(|whole| resize_area(whole, size.0, size.1).ok()) {
-                Some(small) => self.warp(small.view(), placement, region, field, correction, &stage),
-                None => self.warp(photo.view(), placement, region, field, correction, &stage),
+                Some(small) => self.warp(small.view(), k, region, correction, &stage),
+                None => self.warp(photo.view(), k, region, correction, &stage),
             }
         };
         let mut drawn = self.each(draw, &stage)?;
@@ -347,15 +383,15 @@ impl<T: PhotoSample> Drawing<'_, T> {
         Ok(drawn)
     }
 
-    /// Calls `draw` for every placement that has a region, one after the other.
+    /// Calls `draw` with the index and the region of every placement that has one, one after the other.
     fn each<D>(
         &self,
-        draw: impl Fn(&Placement, Bounds, Option<&DisplacementField>) -> Result<D, Cancelled>,
+        draw: impl Fn(usize, Bounds) -> Result<D, Cancelled>,
         stage: &Stage<'_>,
     ) -> Result<Vec<Option<D>>, Cancelled> {
         let mut drawn = Vec::with_capacity(self.regions.len());
-        for ((placement, region), field) in self.layout.placements.iter().zip(self.regions).zip(self.fields) {
-            drawn.push(region.map(|region| draw(placement, region, field.as_ref())).transpose()?);
+        for (k, region) in self.regions.iter().enumerate() {
+            drawn.push(region.map(|region| draw(k, region)).transpose()?);
             stage.add(1)?;
         }
         Ok(drawn)
@@ -365,12 +401,12 @@ impl<T: PhotoSample> Drawing<'_, T> {
     fn warp<D: Channel>(
         &self,
         photo: ImageView<'_, D, 3>,
-        placement: &Placement,
+        k: usize,
         region: Bounds,
-        field: Option<&DisplacementField>,
         correction: Option<ExposureCorrection<'_>>,
         stage: &Stage<'_>,
     ) -> Result<WarpedPhoto<D>, Cancelled> {
+        let (placement, field) = (&self.layout.placements[k], self.fields[k].as_ref());
         let (shrink, interpolation) = (self.shrink(), self.options.interpolation);
         if shrink == 1 {
             let settings = WarpSettings { displacement: field, interpolation, correction };
@@ -388,6 +424,7 @@ fn crop<T: Sample>(p: &mut Panorama<T>, stage: &Stage<'_>) -> Result<(), Cancell
     let Some(b) = largest_rectangle(p.mask.view(), stage)? else { return Ok(()) };
     let (w, h) = (b.width(), b.height());
     p.full_circle &= w == p.image.width();
+    p.size = (w, h);
     if let Some(view) = p.image.view().crop(b.left, b.top, w, h) {
         p.image = view.to_image();
     }

@@ -81,8 +81,8 @@ pub mod features {
     };
 }
 pub use panorama::{
-    LeftOut, NearestPair, PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto, PanoramaResult,
-    panorama, panorama_with,
+    LeftOut, NearestPair, PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto, PanoramaPrior,
+    PanoramaResult, panorama, panorama_streamed, panorama_with,
 };
 /// Types of the panorama's stages.
 pub mod panorama_types {

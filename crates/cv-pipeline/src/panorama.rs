@@ -2,14 +2,17 @@
 
 mod order;
 mod register;
+mod streamed;
+
+pub use streamed::{PanoramaPrior, panorama_streamed};
 
 use crate::Progress;
 use crate::matching::{MatchingOptions, correspondences};
 use cv_core::{Camera, Cancelled, Correspondence, DMatch, Image, ImageView, Mask, RgbF32, StageClock};
 use cv_features::{FeatureError, FeatureOptions, Features, SiftOptions};
 use cv_panorama::{
-    AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, EightBits, PairRejection, PhotoMap,
-    PhotoSample, Registration, RegistrationError, RenderError, Unplaced, VerifyOptions, render,
+    AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, EightBits, PairRejection, Panorama,
+    PhotoMap, PhotoSample, Registration, RegistrationError, RenderError, Unplaced, VerifyOptions, render,
 };
 use order::Order;
 use register::{Registered, register};
@@ -149,7 +152,10 @@ pub struct PanoramaPair {
 /// A panorama with its registration and matches.
 #[derive(Debug, Clone)]
 pub struct PanoramaResult<T = u8> {
-    /// The image, of the bit depth of the photographs; black where no photograph covers it.
+    /// Width and height in pixels.
+    pub size: (usize, usize),
+    /// The image, of the bit depth of the photographs; black where no photograph covers it. As `mask` and `labels`, empty where the panorama was
+    /// [streamed](panorama_streamed).
     pub image: Image<T, 3>,
     /// Linear scene radiance, if requested by [`CompositingOptions::radiance`]; 1 is white in the reference photograph.
     pub radiance: Option<RgbF32>,
@@ -283,7 +289,13 @@ pub fn panorama_with<T: PhotoSample>(
     let order = Order::of(photos);
     let (photos, sizes) = (order.sorted(photos), order.sorted(&sizes));
     let alignment = order.sorted_alignment(registration.alignment());
-    let images = alignment.views.iter().zip(&sizes).map(|(view, &size)| PanoramaImage {
+    let found = known_registration(alignment, &sizes);
+    composite(&photos, found, options, progress).map(|result| order.restored_result(result))
+}
+
+/// Returns a registration as if by features.
+fn known_registration(alignment: Alignment, sizes: &[(usize, usize)]) -> Registered {
+    let images = alignment.views.iter().zip(sizes).map(|(view, &size)| PanoramaImage {
         size,
         used: view.is_ok(),
         reason: view.as_ref().err().map(|why| match *why {
@@ -296,8 +308,7 @@ pub fn panorama_with<T: PhotoSample>(
         gain: [1.0; 3],
     });
     let images = images.collect();
-    let found = Registered { alignment, images, pairs: Vec::new(), features: Vec::new(), clock: StageClock::new() };
-    composite(&photos, found, options, progress).map(|result| order.restored_result(result))
+    Registered { alignment, images, pairs: Vec::new(), features: Vec::new(), clock: StageClock::new() }
 }
 
 /// Composites the panorama and collects the result.
@@ -307,11 +318,19 @@ fn composite<T: PhotoSample>(
     options: &CompositingOptions,
     progress: &dyn Progress,
 ) -> Result<PanoramaResult<T>, PanoramaError> {
+    collected(found, |alignment| render(photos, alignment, options, progress))
+}
+
+/// Composites the panorama by `draw` and collects the result.
+fn collected<T: PhotoSample>(
+    found: Registered,
+    draw: impl FnOnce(&Alignment) -> Result<Panorama<T>, RenderError>,
+) -> Result<PanoramaResult<T>, PanoramaError> {
     let Registered { alignment, mut images, pairs, features, mut clock } = found;
     for (image, view) in images.iter_mut().zip(&alignment.views) {
         image.focal = view.as_ref().ok().filter(|_| alignment.motion == CameraMotion::Rotation).map(|v| v.camera.fx);
     }
-    let drawn = render(photos, &alignment, options, progress)?;
+    let drawn = draw(&alignment)?;
     for (image, gain) in images.iter_mut().zip(&drawn.gains.gains) {
         image.gain = *gain;
     }
@@ -319,6 +338,7 @@ fn composite<T: PhotoSample>(
         clock.add(stage, *seconds);
     }
     Ok(PanoramaResult {
+        size: drawn.size,
         image: drawn.image,
         radiance: drawn.radiance,
         mask: drawn.mask,

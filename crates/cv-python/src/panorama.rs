@@ -48,6 +48,7 @@ impl Arguments {
         o.render.framing = framing(options)?;
         options.set_named("blend", &mut o.render.blend)?;
         options.set_named("seams", &mut o.render.seams)?;
+        options.set("clean", &mut o.render.removes_transients)?;
         options.set_named("exposure", &mut o.render.exposure)?;
         options.set("crop", &mut o.render.crop)?;
         options.set("scale", &mut o.render.resolution)?;

@@ -2,6 +2,7 @@
 
 mod registration;
 mod report;
+mod streamed;
 
 use crate::frame::{Context, Failure, Global, Outcome, Output, Run, Step, expand_images, named, spare_inputs, steps};
 use crate::{rig, words};
@@ -29,6 +30,9 @@ const ENDINGS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff", "exr"];
     cv panorama a.jpg b.jpg c.jpg -o pano.png --blend poisson --report out/\n  \
     cv panorama a.jpg b.jpg c.jpg -o pano.png --alpha\n  \
     cv panorama raw16/*.tif -o pano.tif\n  \
+    cv panorama raw16/*.tif -o pano.tif --layers layers/\n  \
+    cv panorama square/ -o empty.png --clean\n  \
+    cv panorama gigapixel/ -o huge.tif --max-memory 4096\n  \
     cv panorama window/*.jpg -o light.exr\n  \
     cv panorama wide/ -o pano.png --camera cam.yaml\n  \
     cv panorama wall/ -o plan.tif --mode plane\n  \
@@ -72,12 +76,19 @@ pub(crate) struct Args {
     /// Seam placement: graph cut along small differences, or the Voronoi diagram of the image centers.
     #[arg(long, value_name = "WHERE", value_parser = named::<Seams>(), default_value_t = PanoramaOptions::default().render.seams)]
     seams: Seams,
+    /// Remove what moves: where three or more photographs show a place, prefer those near their median, so that people who walk through vanish.
+    #[arg(long)]
+    clean: bool,
     /// Exposure compensation: none, or match: exposures and white balances, with the camera response and vignetting, estimated jointly in linear intensity.
     #[arg(long, value_name = "WHAT", value_parser = named::<Exposure>(), default_value_t = PanoramaOptions::default().render.exposure)]
     exposure: Exposure,
     /// Crop the result to the largest rectangle without empty pixels.
     #[arg(long)]
     crop: bool,
+    /// Write each warped, exposure-compensated photograph as a TIFF with its seam mask as alpha, for retouching: at its position on the canvas
+    /// (XPosition, YPosition), as GIMP, Photoshop scripts and Hugin read them.
+    #[arg(long, value_name = "DIR")]
+    layers: Option<PathBuf>,
     /// Add an alpha channel, transparent where no photograph reaches; for .png and .tif.
     #[arg(long)]
     alpha: bool,
@@ -138,6 +149,7 @@ impl Args {
         };
         options.render.blend = self.blend;
         options.render.seams = self.seams;
+        options.render.removes_transients = self.clean;
         options.render.exposure = self.exposure;
         options.render.crop = self.crop;
         options.render.radiance = self.ends_in(&["exr"]);
@@ -153,7 +165,8 @@ impl Args {
 impl Run for Args {
     fn outputs(&self) -> Vec<Output<'_>> {
         let registration = self.save_registration.as_deref().map(|path| Output::File(path, registration::ENDINGS));
-        [Output::File(&self.output, ENDINGS)].into_iter().chain(registration).collect()
+        let layers = self.layers.as_deref().map(Output::Folder);
+        [Output::File(&self.output, ENDINGS)].into_iter().chain(registration).chain(layers).collect()
     }
 
     fn has_no_use_for(&self) -> &'static [Global] {
@@ -177,11 +190,23 @@ impl Run for Args {
         if self.alpha && self.ends_in(&["exr"]) {
             return Err(Failure::usage("--alpha needs a .png or .tif: OpenEXR is written without an alpha channel"));
         }
+        if self.clean && self.seams == Seams::Voronoi {
+            return Err(Failure::usage("--clean has no effect with --seams voronoi, which ignores the content")
+                .advice("--seams graphcut"));
+        }
+        if self.layers.is_some() && (self.blend == BlendMode::Poisson || self.ends_in(&["exr"])) {
+            return Err(Failure::usage("--layers cannot be combined with --blend poisson and .exr outputs")
+                .advice("--blend multiband, and an output as .tif"));
+        }
         let registration = self.registration.as_deref().map(|path| registration::read(path, context)).transpose()?;
         let paths = expand_images(&self.images)?;
         let results: Vec<PathBuf> = [&self.output].into_iter().chain(&self.save_registration).cloned().collect();
         let inputs: Vec<&Path> = paths.iter().chain(&self.registration).map(PathBuf::as_path).collect();
         spare_inputs(&results, &inputs)?;
+        // Streamed panoramas have the same pixels, and layers at hand.
+        if let Some(bytes) = context.max_memory.or_else(|| self.layers.as_ref().map(|_| usize::MAX / 4)) {
+            return self.stitch_streamed(&paths, registration.as_ref(), bytes, context);
+        }
         let pictures = paths.par_iter().map(cv_io::read_image).collect::<Result<Vec<_>, _>>()?;
         let known: Vec<_> =
             pictures.iter().map(|p| (p.exif.focal.as_ref().map(|focal| focal.pixels), p.metadata.clone())).collect();
@@ -245,7 +270,8 @@ impl Args {
         };
         let result = result.map_err(|error| words::no_panorama(error, paths))?;
         let files: Vec<&Metadata> = known.iter().map(|(_, metadata)| metadata).collect();
-        let metadata = metadata(&files, &result);
+        let used = (0..files.len()).filter(|&index| result.images[index].used);
+        let metadata = metadata(&files, result.alignment.reference, used);
         context.write(Output::File(&self.output, ENDINGS), |path| {
             if let Some(radiance) = &result.radiance {
                 cv_io::write_exr(path, radiance.view())
@@ -255,8 +281,26 @@ impl Args {
                 cv_io::write_image(path, result.image.view(), &metadata)
             }
         })?;
+        self.conclude(paths, &result, context)?;
+        context.report(|| {
+            let photos: Vec<_> = images.iter().chain([&result.image]).map(Image::view).collect();
+            let photos = EightBits::new(&photos, "report", context)?;
+            report::report(paths, &photos.views(), result.labels.view(), &result)
+        })?;
+        Ok(outcome(paths, &result))
+    }
+}
+
+impl Args {
+    /// Writes the registration, and warns of what is wrong with a panorama.
+    fn conclude<T: PhotoSample>(
+        &self,
+        paths: &[PathBuf],
+        result: &PanoramaResult<T>,
+        context: &Context,
+    ) -> Result<(), Failure> {
         if let Some(path) = &self.save_registration {
-            registration::write(path, &result, paths, context)?;
+            registration::write(path, result, paths, context)?;
         }
         for (path, image) in paths.iter().zip(&result.images) {
             if let Some(reason) = &image.reason {
@@ -276,19 +320,15 @@ impl Args {
                 "the photographs reach beyond the {across:.0} by {up:.0} degrees of the {projection} projection and are cut off; --projection spherical draws all of them"
             ));
         }
-        context.report(|| {
-            let photos: Vec<_> = images.iter().chain([&result.image]).map(Image::view).collect();
-            report::report(paths, &EightBits::new(&photos, "report", context)?.views(), &result)
-        })?;
-        Ok(outcome(paths, &result))
+        Ok(())
     }
 }
 
 /// Returns the metadata of the reference photograph; its color profile only if all registered photographs share it.
-fn metadata<T>(files: &[&Metadata], result: &PanoramaResult<T>) -> Metadata {
-    let Some(reference) = files.get(result.alignment.reference) else { return Metadata::default() };
-    let mut used = files.iter().zip(&result.images).filter(|(_, image)| image.used);
-    let icc = reference.icc.clone().filter(|_| used.all(|(file, _)| file.icc == reference.icc));
+fn metadata(files: &[&Metadata], reference: usize, used: impl IntoIterator<Item = usize>) -> Metadata {
+    let Some(reference) = files.get(reference) else { return Metadata::default() };
+    let mut used = used.into_iter().filter_map(|index| files.get(index));
+    let icc = reference.icc.clone().filter(|_| used.all(|file| file.icc == reference.icc));
     Metadata { exif: reference.exif.clone(), icc }
 }
 
@@ -311,7 +351,7 @@ fn outcome<T: PhotoSample>(paths: &[PathBuf], result: &PanoramaResult<T>) -> Out
         })
         .collect();
     let used = result.images.iter().filter(|i| i.used).count();
-    let (w, h) = result.image.size();
+    let (w, h) = result.size;
     Outcome::new(result.stages.clone())
         .with("images", images)
         .with("size", [w, h])

@@ -7,6 +7,8 @@ use cv_core::{Cancelled, Image, Progress, Stage};
 
 /// Half width of the transition in pixels.
 const RADIUS: usize = 8;
+/// Rows on either side of a pixel that its weights depend on.
+pub(crate) const MARGIN: usize = RADIUS + 1;
 
 /// Weights each photograph by the box-filtered indicator of its label, kernel side `2 · RADIUS + 1`.
 pub(crate) struct Feather;

@@ -8,6 +8,9 @@ mod hard_seams;
 mod multiband;
 mod poisson;
 
+pub(crate) use feather::MARGIN as FEATHER_MARGIN;
+pub(crate) use multiband::{CoarseCanvas, CoarseLevels, coarse_margin};
+
 use crate::bit_depth::{Channel, PhotoSample};
 use crate::surface::WarpedPhoto;
 use cv_core::{Cancelled, Image, Progress, named};

@@ -12,8 +12,103 @@ use crate::rows::for_each_row_with;
 use crate::surface::WarpedPhoto;
 use cv_core::{Cancelled, Image, Progress, Stage};
 use fearless_simd::dispatch;
+use std::ops::RangeInclusive;
 
 type Pixel = [f32; 4];
+
+/// Bands above the coarse levels of [`CoarseLevels`], at most: those take a fiftieth of the memory of the whole pyramid then, and strips overlap by some
+/// hundred rows.
+const FINE_BANDS: usize = 3;
+
+/// The coarse levels of the blended canvas. With them it is blended in strips of rows, each with the fine bands of its rows only, to the same values as
+/// whole.
+pub(crate) struct CoarseLevels {
+    pyramid: Pyramid,
+    /// Bands above the first level.
+    fine: usize,
+}
+
+/// Bands that are fine in a pyramid of `bands` bands.
+fn fine_bands(bands: usize) -> usize {
+    FINE_BANDS.min(bands.max(1) - 1)
+}
+
+/// Returns the rows by which a strip must be larger on either side: twice the support of the kernel, and three pixels for upsampling, at the first of the
+/// coarse levels.
+pub(crate) fn coarse_margin(bands: usize) -> usize {
+    6 << (fine_bands(bands) + 1)
+}
+
+impl CoarseLevels {
+    /// Creates the levels of a canvas of this size that is blended with `bands` bands.
+    pub(crate) fn new(width: usize, height: usize, bands: usize) -> Self {
+        let (bands, fine) = (bands.max(1), fine_bands(bands));
+        Self { pyramid: Pyramid::new(width, height, fine + 1..=bands, true), fine }
+    }
+
+    /// Adds a photograph, in its own coordinates, at a position of the canvas; `labels` are those of its pixels. Photographs must be added in the order of their
+    /// labels.
+    ///
+    /// # Errors
+    /// [`Cancelled`].
+    pub(crate) fn add<T: Channel>(
+        &mut self,
+        (left, top): (usize, usize),
+        photo: WarpedPhoto<T>,
+        labels: &Image<u16, 1>,
+        label: u16,
+        stage: &Stage<'_>,
+    ) -> Result<(), Cancelled> {
+        let mut level = halve_photo(&photo, labels, label, stage)?;
+        drop(photo);
+        for _ in 0..self.fine {
+            level = halve(&level, stage)?;
+        }
+        (level.left, level.top) = (left >> (self.fine + 1), top >> (self.fine + 1));
+        self.pyramid.add(&level, stage)
+    }
+
+    /// Normalizes and collapses the levels.
+    ///
+    /// # Errors
+    /// [`Cancelled`].
+    pub(crate) fn blended(self, stage: &Stage<'_>) -> Result<CoarseCanvas, Cancelled> {
+        Ok(CoarseCanvas { level: self.pyramid.collapse(None, stage)?, fine: self.fine })
+    }
+}
+
+/// The blended canvas without its fine bands.
+pub(crate) struct CoarseCanvas {
+    level: Level,
+    fine: usize,
+}
+
+impl CoarseCanvas {
+    /// Blends a strip that begins at row `top` of the canvas; photographs and labels are those of its rows, in its coordinates. Its first and last row must be
+    /// multiples of 2^bands, or those of the canvas. Rows closer to its ends than [`coarse_margin`] are not valid, except at the ends of the canvas.
+    ///
+    /// # Errors
+    /// [`Cancelled`].
+    pub(crate) fn strip<T: Channel>(
+        &self,
+        top: usize,
+        photos: &[Option<WarpedPhoto<T>>],
+        labels: &Image<u16, 1>,
+        stage: &Stage<'_>,
+    ) -> Result<Image<T, 3>, Cancelled> {
+        let Level { width, height, ref data, .. } = self.level;
+        let unit = 1 << (self.fine + 1);
+        let rows = top / unit..(top + labels.height()).div_ceil(unit).min(height);
+        let base = Level {
+            left: 0,
+            top: 0,
+            width,
+            height: rows.len(),
+            data: data[rows.start * width..rows.end * width].to_vec(),
+        };
+        join(photos, labels, self.fine, Some(base), stage)
+    }
+}
 
 /// A rectangle of a pyramid level with its top-left corner at `(left, top)` of that level of the canvas.
 struct Level {
@@ -45,21 +140,23 @@ impl<T: Channel> Blender<T> for Multiband {
     fn blend(&self, composition: &Composition<'_, T>, progress: &dyn Progress) -> Result<Image<T, 3>, Cancelled> {
         let stage = Stage::new(progress, "blend", composition.photos.len() + 1)?;
         let bands = Blender::<T>::pyramid_levels(self, composition.typical_side);
-        let image = join(composition.photos, composition.labels, bands, &stage)?;
+        let image = join(composition.photos, composition.labels, bands.max(1), None, &stage)?;
         stage.add(1)?;
         Ok(image)
     }
 }
 
-/// Blends the photographs with `bands` Laplacian bands above the residual, at least one; black without a label.
+/// Blends the photographs with `bands` Laplacian bands above the residual; black without a label. The residual is `base`, blended at the level below the
+/// bands, or else that of these photographs (with one band or more).
 fn join<T: Channel>(
     photos: &[Option<WarpedPhoto<T>>],
     labels: &Image<u16, 1>,
     bands: usize,
+    base: Option<Level>,
     stage: &Stage<'_>,
 ) -> Result<Image<T, 3>, Cancelled> {
     let (width, height) = labels.size();
-    let mut pyramid = Pyramid::new(width, height, bands.max(1));
+    let mut pyramid = Pyramid::new(width, height, 1..=bands, base.is_none());
     let mut halves = Vec::with_capacity(photos.len());
     for (label, photo) in photos.iter().enumerate() {
         let half = photo.as_ref().map(|photo| halve_photo(photo, labels, label as u16, stage)).transpose()?;
@@ -69,7 +166,7 @@ fn join<T: Channel>(
         halves.push(half);
         stage.add(1)?;
     }
-    let canvas = pyramid.collapse(stage)?;
+    let canvas = pyramid.collapse(base, stage)?;
     for half in halves.iter_mut().flatten() {
         let (left, top, width) = (half.left, half.top, half.width);
         for_each_row_with(
@@ -110,21 +207,24 @@ fn join<T: Channel>(
     Ok(image)
 }
 
-/// Laplacian pyramid of weighted sums, starting at half resolution of the canvas.
+/// A range of levels of a Laplacian pyramid of weighted sums.
 struct Pyramid {
     levels: Vec<Level>,
+    /// Whether the last level is the residual, not a band.
+    has_residual: bool,
 }
 
 impl Pyramid {
-    /// Creates the pyramid of a canvas of this (full) size with `bands` bands above the residual, including that of full resolution.
-    fn new(width: usize, height: usize, bands: usize) -> Self {
-        let levels = (1..=bands).map(|l| Level::new(0, 0, width.div_ceil(1 << l), height.div_ceil(1 << l))).collect();
-        Self { levels }
+    /// Creates the levels `range` of the pyramid of a canvas of this (full) size; level 1 has half its resolution.
+    fn new(width: usize, height: usize, range: RangeInclusive<usize>, has_residual: bool) -> Self {
+        let levels = range.map(|l| Level::new(0, 0, width.div_ceil(1 << l), height.div_ceil(1 << l))).collect();
+        Self { levels, has_residual }
     }
 
-    /// Adds a photograph at half resolution.
+    /// Adds a photograph at the resolution of the first level.
     fn add(&mut self, half: &Level, stage: &Stage<'_>) -> Result<(), Cancelled> {
-        let Some((last, bands)) = self.levels.split_last_mut() else { return Ok(()) };
+        let count = self.levels.len() - usize::from(self.has_residual);
+        let (bands, residual) = self.levels.split_at_mut(count);
         let mut smaller: Option<Level> = None;
         for sum in bands {
             let level = smaller.as_ref().unwrap_or(half);
@@ -132,11 +232,15 @@ impl Pyramid {
             add_band(sum, level, Some(&next), stage)?;
             smaller = Some(next);
         }
-        add_band(last, smaller.as_ref().unwrap_or(half), None, stage)
+        match residual.first_mut() {
+            Some(last) => add_band(last, smaller.as_ref().unwrap_or(half), None, stage),
+            None => Ok(()),
+        }
     }
 
-    /// Normalizes and collapses the pyramid to the blended canvas at half resolution.
-    fn collapse(mut self, stage: &Stage<'_>) -> Result<Level, Cancelled> {
+    /// Normalizes and collapses the levels to the blended canvas at the resolution of the first; `base` is the blended canvas at the level after the last
+    /// band, where the pyramid has no residual.
+    fn collapse(mut self, base: Option<Level>, stage: &Stage<'_>) -> Result<Level, Cancelled> {
         let simd = fearless_simd::Level::new();
         for level in &mut self.levels {
             for_each_row_with(
@@ -153,7 +257,7 @@ impl Pyramid {
                 },
             )?;
         }
-        let mut canvas = self.levels.pop().unwrap_or_else(|| Level::new(0, 0, 0, 0));
+        let mut canvas = base.or_else(|| self.levels.pop()).unwrap_or_else(|| Level::new(0, 0, 0, 0));
         while let Some(mut larger) = self.levels.pop() {
             for_each_row_with(&mut larger.data, larger.width, stage, Vec::new, |buffer, y, row| {
                 dispatch!(simd, _simd => {
@@ -361,7 +465,7 @@ mod tests {
     /// Photographs of the whole canvas joined with so many bands.
     fn joined(photos: &[WarpedPhoto], labels: &Image<u16, 1>, bands: usize) -> Image<u8, 3> {
         let photos: Vec<_> = photos.iter().cloned().map(Some).collect();
-        join(&photos, labels, bands, &stage()).unwrap()
+        join(&photos, labels, bands, None, &stage()).unwrap()
     }
 
     fn scene(x: usize, y: usize) -> [u8; 3] {

@@ -36,7 +36,8 @@ where
 {
     /// Expands every label in turn until the energy no longer decreases, at most `rounds` times.
     pub(super) fn expand(&self, labels: &mut Image<u16, 1>, rounds: usize, stage: &Stage<'_>) -> Result<(), Cancelled> {
-        let groups = independent_groups(self.photos);
+        let bounds: Vec<Option<Bounds>> = self.photos.iter().map(|photo| photo.map(|p| p.bounds)).collect();
+        let groups = independent_groups(&bounds);
         // A label is tried again only if a label near it changed.
         let mut stale = vec![true; self.photos.len()];
         for _ in 0..rounds {
@@ -49,7 +50,7 @@ where
                 for (&alpha, changed) in turn.iter().zip(&changes).filter(|(_, changed)| !changed.is_empty()) {
                     changed.iter().for_each(|&i| labels.as_mut_slice()[i] = alpha as u16);
                     for (other, s) in stale.iter_mut().enumerate() {
-                        *s |= other != alpha && touch(self.photos, other, alpha);
+                        *s |= other != alpha && touch(&bounds, other, alpha);
                     }
                 }
             }
@@ -61,7 +62,12 @@ where
     }
 
     /// Returns the indices of the pixels that the optimal expansion of `alpha` relabels.
-    fn expand_one(&self, labels: &Image<u16, 1>, alpha: usize, stage: &Stage<'_>) -> Result<Vec<usize>, Cancelled> {
+    pub(super) fn expand_one(
+        &self,
+        labels: &Image<u16, 1>,
+        alpha: usize,
+        stage: &Stage<'_>,
+    ) -> Result<Vec<usize>, Cancelled> {
         let (width, height) = labels.size();
         let Some(own) = self.photos[alpha] else { return Ok(Vec::new()) };
         let Some(b) = own.bounds.intersection(&Bounds { left: 0, top: 0, right: width, bottom: height }) else {
@@ -155,16 +161,16 @@ where
 }
 
 /// Returns whether the bounds of two photographs overlap or touch.
-fn touch(photos: &[Option<&WarpedPhoto>], a: usize, b: usize) -> bool {
-    let (Some(a), Some(b)) = (photos[a], photos[b]) else { return false };
-    a.bounds.grown(1, usize::MAX, usize::MAX).intersection(&b.bounds).is_some()
+fn touch(bounds: &[Option<Bounds>], a: usize, b: usize) -> bool {
+    let (Some(a), Some(b)) = (bounds[a], bounds[b]) else { return false };
+    a.grown(1, usize::MAX, usize::MAX).intersection(&b).is_some()
 }
 
 /// Partitions the photographs into groups that do not touch: expansions within a group are independent and run in parallel.
-fn independent_groups(photos: &[Option<&WarpedPhoto>]) -> Vec<Vec<usize>> {
+pub(super) fn independent_groups(bounds: &[Option<Bounds>]) -> Vec<Vec<usize>> {
     let mut groups: Vec<Vec<usize>> = Vec::new();
-    for k in 0..photos.len() {
-        match groups.iter_mut().find(|group| group.iter().all(|&other| !touch(photos, k, other))) {
+    for k in 0..bounds.len() {
+        match groups.iter_mut().find(|group| group.iter().all(|&other| !touch(bounds, k, other))) {
             Some(group) => group.push(k),
             None => groups.push(vec![k]),
         }
@@ -282,10 +288,8 @@ mod tests {
 
     #[test]
     fn photographs_that_touch_are_never_tried_at_once() {
-        let at =
-            |left: usize, top: usize| drawn(Bounds { left, top, right: left + 10, bottom: top + 10 }, |_, _| [0; 3]);
-        let photos = [at(0, 0), at(10, 0), at(21, 0), at(0, 11), at(40, 40)];
-        let photos: Vec<Option<&WarpedPhoto>> = photos.iter().map(Some).chain([None]).collect();
+        let at = |left: usize, top: usize| Some(Bounds { left, top, right: left + 10, bottom: top + 10 });
+        let photos = [at(0, 0), at(10, 0), at(21, 0), at(0, 11), at(40, 40), None];
         let groups = independent_groups(&photos);
         assert_eq!(groups.iter().map(Vec::len).sum::<usize>(), photos.len());
         for group in &groups {

@@ -7,9 +7,12 @@
 mod alpha_expansion;
 mod cost;
 mod misalignment;
+mod transient;
 mod upsample;
+mod windows;
 
-pub(crate) use upsample::upsample;
+pub(crate) use upsample::{upsample, upsample_rows};
+pub(crate) use windows::{refine_in_windows, window_memory};
 
 use crate::blend::NO_PHOTO;
 use crate::rows::{for_each_row, is_check_due};
@@ -18,6 +21,7 @@ use alpha_expansion::Labeling;
 use cost::difference;
 use cv_core::{Cancelled, Image, Progress, Stage, named};
 use misalignment::Misalignments;
+use transient::transient_costs;
 
 /// Seam finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -70,6 +74,7 @@ pub(crate) fn on_preview(
     photo_of: &[usize],
     seams: Seams,
     radiance: bool,
+    removes_transients: bool,
     progress: &dyn Progress,
 ) -> Result<Image<u16, 1>, Cancelled> {
     let clipped = if radiance { CLIPPED_RADIANCE_COST } else { CLIPPED_COST };
@@ -93,7 +98,11 @@ pub(crate) fn on_preview(
         four.into_iter().map(|(i, j)| differ(a, b, 2 * x + i, 2 * y + j)).fold(0, i32::max)
     };
     // A pixel represents four, a unit of seam length two.
-    let pixel = |label: usize, x: usize, y: usize| (2.0 * data_term(&half.pieces[label], clipped, x, y)) as i32;
+    let half_transients = removes_transients.then(|| transient_costs(&half));
+    let pixel = |label: usize, x: usize, y: usize| {
+        let transient = transient_at(half_transients.as_deref(), &half, label, x, y);
+        (2.0 * (data_term(&half.pieces[label], clipped, x, y) + transient)) as i32
+    };
     let reach: Vec<_> = half.pieces.iter().map(|p| Some(&p.warped)).collect();
     // Further rounds hardly lower the energy.
     let labeling = Labeling { photos: &reach, unary: pixel, difference: max_difference, free: |_, _| true };
@@ -111,7 +120,11 @@ pub(crate) fn on_preview(
         }
     }
     let near = seam_band(&labels, BAND_RADIUS, &stage)?;
-    let pixel = |label: usize, x: usize, y: usize| data_term(&preview.pieces[label], clipped, x, y) as i32;
+    let transients = removes_transients.then(|| transient_costs(preview));
+    let pixel = |label: usize, x: usize, y: usize| {
+        let transient = transient_at(transients.as_deref(), preview, label, x, y);
+        (data_term(&preview.pieces[label], clipped, x, y) + transient) as i32
+    };
     let labeling =
         Labeling { photos: &pieces, unary: pixel, difference: differ, free: |x: usize, y: usize| near[y * width + x] };
     labeling.expand(&mut labels, 1, &stage)?;
@@ -136,6 +149,12 @@ fn data_term(piece: &Piece, clipped: f32, x: usize, y: usize) -> f32 {
     ECCENTRICITY_COST * piece.eccentricity[i] + if piece.clipped[i] { clipped } else { 0.0 }
 }
 
+/// Returns the cost of [`transient_costs`] of a pixel, 0 without them.
+fn transient_at(costs: Option<&[Vec<f32>]>, preview: &Preview, label: usize, x: usize, y: usize) -> f32 {
+    let b = preview.pieces[label].warped.bounds;
+    costs.map_or(0.0, |costs| costs[label][(y - b.top) * b.width() + x - b.left])
+}
+
 fn eccentricity(piece: &Piece, x: usize, y: usize) -> f32 {
     let b = piece.warped.bounds;
     piece.eccentricity[(y - b.top) * b.width() + x - b.left]
@@ -155,8 +174,8 @@ pub(crate) fn refine(
     let stage = Stage::new(progress, "seams", 3)?;
     let pieces: Vec<Option<&WarpedPhoto>> = photos.iter().map(Option::as_ref).collect();
     let mut reach = 2 * step;
-    if step > BLOCK {
-        refine_blocks(labels, &pieces, reach.div_ceil(BLOCK), &stage)?;
+    if let Some(radius) = refined_block_radius(step) {
+        refine_blocks(labels, &pieces, radius, &stage)?;
         reach = BLOCK + BLOCK / 2;
     }
     stage.add(1)?;
@@ -167,6 +186,11 @@ pub(crate) fn refine(
     let free = |x: usize, y: usize| near[y * width + x];
     Labeling { photos: &pieces, unary: |_, _, _| 0, difference: differ, free }.expand(labels, 1, &stage)?;
     stage.add(1)
+}
+
+/// Returns by how many blocks seams are refined before single pixels, for a preview of this step; `None` where blocks are no smaller than its pixels.
+fn refined_block_radius(step: usize) -> Option<usize> {
+    (step > BLOCK).then(|| (2 * step).div_ceil(BLOCK))
 }
 
 /// Refines seams by up to `reach` blocks. The label of a block is that of its center; the difference is the maximum over four pixels.
@@ -184,11 +208,7 @@ fn refine_blocks(
     let subsampled: Vec<Option<WarpedPhoto>> = photos.iter().map(|photo| photo.map(subsampled)).collect();
     let reached: Vec<Option<&WarpedPhoto>> = subsampled.iter().map(Option::as_ref).collect();
     let near = seam_band(&before, reach, stage)?;
-    let differ = |a: usize, c: usize, x: usize, y: usize| {
-        let of = |x: usize, y: usize| difference(photos[a], photos[c], x, y);
-        let (x, y) = (BLOCK * x, BLOCK * y);
-        of(x, y).max(of(x + MIDDLE, y)).max(of(x, y + MIDDLE)).max(of(x + MIDDLE, y + MIDDLE))
-    };
+    let differ = |a: usize, c: usize, x: usize, y: usize| block_difference(photos, a, c, x, y);
     let free = |x: usize, y: usize| near[y * across + x];
     let mut after = before.clone();
     Labeling { photos: &reached, unary: |_, _, _| 0, difference: differ, free }.expand(&mut after, 1, stage)?;
@@ -206,12 +226,24 @@ fn refine_blocks(
     Ok(())
 }
 
+/// Returns the difference of two photographs in a block: the maximum over four pixels.
+fn block_difference(photos: &[Option<&WarpedPhoto>], a: usize, c: usize, x: usize, y: usize) -> i32 {
+    let of = |x: usize, y: usize| difference(photos[a], photos[c], x, y);
+    let (x, y, middle) = (BLOCK * x, BLOCK * y, BLOCK / 2);
+    of(x, y).max(of(x + middle, y)).max(of(x, y + middle)).max(of(x + middle, y + middle))
+}
+
+/// Returns the blocks whose centers lie inside the bounds.
+fn block_bounds(b: Bounds) -> Bounds {
+    // The first block whose middle is not before a column or row.
+    let block = |v: usize| v.saturating_sub(BLOCK / 2).div_ceil(BLOCK);
+    Bounds { left: block(b.left), top: block(b.top), right: block(b.right), bottom: block(b.bottom) }
+}
+
 /// Samples a photograph at the centers of the blocks.
 fn subsampled(photo: &WarpedPhoto) -> WarpedPhoto {
     let b = photo.bounds;
-    // The first block whose middle is not before a column or row.
-    let block = |v: usize| v.saturating_sub(BLOCK / 2).div_ceil(BLOCK);
-    let bounds = Bounds { left: block(b.left), top: block(b.top), right: block(b.right), bottom: block(b.bottom) };
+    let bounds = block_bounds(b);
     let middle = |v: usize| BLOCK * v + BLOCK / 2;
     let pixels = Image::from_fn(bounds.width(), bounds.height(), |x, y| {
         photo.pixels.at(middle(bounds.left + x) - b.left, middle(bounds.top + y) - b.top)
@@ -350,7 +382,7 @@ mod tests {
 
     #[test]
     fn voronoi_takes_the_photograph_whose_middle_is_nearest() {
-        let labels = on_preview(&preview(), &[0, 1], Seams::Voronoi, false, &Silent).unwrap();
+        let labels = on_preview(&preview(), &[0, 1], Seams::Voronoi, false, false, &Silent).unwrap();
         for (x, y) in (0..SIZE.1).flat_map(|y| (0..SIZE.0).map(move |x| (x, y))) {
             // Both are 120 wide: half-way between columns 60 and 100.
             assert_eq!(labels.at(x, y)[0], u16::from(x >= 80), "{x} {y}");
@@ -360,8 +392,8 @@ mod tests {
     #[test]
     fn a_graph_cut_runs_around_what_the_photographs_show_at_two_places() {
         let preview = preview();
-        let straight = on_preview(&preview, &[0, 1], Seams::Voronoi, false, &Silent).unwrap();
-        let cut = on_preview(&preview, &[0, 1], Seams::GraphCut, false, &Silent).unwrap();
+        let straight = on_preview(&preview, &[0, 1], Seams::Voronoi, false, false, &Silent).unwrap();
+        let cut = on_preview(&preview, &[0, 1], Seams::GraphCut, false, false, &Silent).unwrap();
         assert!(misfit(&straight, &preview) > 10_000, "{}", misfit(&straight, &preview));
         // Around the pole both show the same: nothing is cut.
         assert_eq!(misfit(&cut, &preview), 0);

@@ -14,6 +14,18 @@ pub(crate) fn upsample<T: Sample>(
     photos: &[Option<WarpedPhoto<T>>],
     stage: &Stage<'_>,
 ) -> Result<Image<u16, 1>, Cancelled> {
+    upsample_rows(coarse, step, 0, (w, h), photos, stage)
+}
+
+/// As [`upsample`], for `h` rows from `top`; photographs are in the coordinates of these rows.
+pub(crate) fn upsample_rows<T: Sample>(
+    coarse: &Image<u16, 1>,
+    step: usize,
+    top: usize,
+    (w, h): (usize, usize),
+    photos: &[Option<WarpedPhoto<T>>],
+    stage: &Stage<'_>,
+) -> Result<Image<u16, 1>, Cancelled> {
     let reaches = |label: u16, x: usize, y: usize| {
         photos.get(usize::from(label)).and_then(Option::as_ref).is_some_and(|p| p.reaches(x, y))
     };
@@ -27,7 +39,7 @@ pub(crate) fn upsample<T: Sample>(
     };
     let columns: Vec<(usize, usize, f32)> = (0..w).map(|x| place(x, cw)).collect();
     for_each_row(labels.as_mut_slice(), w, stage, |y, row| {
-        let (y0, y1, fy) = place(y, ch);
+        let (y0, y1, fy) = place(top + y, ch);
         for (x, out) in row.iter_mut().enumerate() {
             let (x0, x1, fx) = columns[x];
             let near = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)].map(|(x, y)| coarse.at(x, y)[0]);

@@ -7,7 +7,16 @@ use cv_core::{Cancelled, ImageView, Stage};
 /// Finds the rectangle of maximum area in which every pixel is true; `None` where no pixel is. O(pixels): the stack algorithm for the largest rectangle
 /// in a histogram, per row.
 pub(crate) fn largest_rectangle(mask: ImageView<'_, bool, 1>, stage: &Stage<'_>) -> Result<Option<Bounds>, Cancelled> {
-    let (w, h) = mask.size();
+    largest_rectangle_of(mask.size(), |y, row| row.copy_from_slice(mask.row(y)), stage)
+}
+
+/// As [`largest_rectangle`], of a mask of this size whose row `y` is written by `mask_row`.
+pub(crate) fn largest_rectangle_of(
+    (w, h): (usize, usize),
+    mut mask_row: impl FnMut(usize, &mut [bool]),
+    stage: &Stage<'_>,
+) -> Result<Option<Bounds>, Cancelled> {
+    let mut inside_row = vec![false; w];
     let mut heights = vec![0_usize; w];
     let mut best: Option<Bounds> = None;
     let area = |b: &Bounds| b.width() * b.height();
@@ -17,7 +26,8 @@ pub(crate) fn largest_rectangle(mask: ImageView<'_, bool, 1>, stage: &Stage<'_>)
         if is_check_due(y, 4 * w) {
             stage.check()?;
         }
-        for (height, inside) in heights.iter_mut().zip(mask.row(y)) {
+        mask_row(y, &mut inside_row);
+        for (height, inside) in heights.iter_mut().zip(&inside_row) {
             *height = if *inside { *height + 1 } else { 0 };
         }
         stack.clear();

@@ -10,6 +10,7 @@ use cv_core::{Cancelled, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
 use cv_imgproc::bilinear_at;
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
+use std::ops::Deref;
 
 /// A correspondence of two placements, in canvas pixels before displacement.
 #[derive(Clone, Copy)]
@@ -36,29 +37,48 @@ pub(crate) fn displacements(
     alignment: &Alignment,
     progress: &dyn Progress,
 ) -> Result<Vec<Option<DisplacementField>>, Cancelled> {
-    // A unit per photograph, and one for every solution and every round of patch registration.
-    let stage = Stage::new(progress, "elastic", photos.len() + 5)?;
-    let side = layout.typical_side();
-    let spacing = (side / CELLS).max(8.0);
-    let mut fields: Vec<_> = layout.placements.iter().map(|p| DisplacementField::over(&p.bounds, spacing)).collect();
-    let mut ties = feature_ties(layout, alignment, MAX_DISPLACEMENT_RATIO * side, &stage)?;
-    // Feature positions have errors of up to a pixel, registered patches of a fraction.
-    solve(&mut fields, &ties, 3.0, &stage)?;
-    stage.add(1)?;
+    let stage = Stage::new(progress, "elastic", photos.len() + ROUND_UNITS)?;
     let gray = |p: &ImageView<'_, u8, 3>| {
         let gray = cv_imgproc::rgb_to_gray(*p);
         stage.add(1).map(|()| gray)
     };
     let grays: Vec<GrayU8> = photos.par_iter().map(gray).collect::<Result<_, _>>()?;
+    displacements_with(&|photo| Ok::<_, Cancelled>(&grays[photo]), layout, alignment, &stage)
+}
+
+/// Units of progress of [`displacements_with`]: one for every solution and every round of patch registration.
+pub(crate) const ROUND_UNITS: usize = 5;
+
+/// As [`displacements`], with the gray image of a photograph loaded by `gray` for each overlap, twice.
+///
+/// # Errors
+/// [`Cancelled`], and errors of `gray`.
+pub(crate) fn displacements_with<G, E>(
+    gray: &(impl Fn(usize) -> Result<G, E> + Sync),
+    layout: &Layout,
+    alignment: &Alignment,
+    stage: &Stage<'_>,
+) -> Result<Vec<Option<DisplacementField>>, E>
+where
+    G: Deref<Target = GrayU8> + Sync,
+    E: From<Cancelled> + Send,
+{
+    let side = layout.typical_side();
+    let spacing = (side / CELLS).max(8.0);
+    let mut fields: Vec<_> = layout.placements.iter().map(|p| DisplacementField::over(&p.bounds, spacing)).collect();
+    let mut ties = feature_ties(layout, alignment, MAX_DISPLACEMENT_RATIO * side, stage)?;
+    // Feature positions have errors of up to a pixel, registered patches of a fraction.
+    solve(&mut fields, &ties, 3.0, stage)?;
+    stage.add(1)?;
     let mut sites = patch_sites(layout, spacing);
     let features = ties.len();
     // The first round brings more patches within the search range of the second.
     for _ in 0..2 {
-        register_patches(&mut sites, &grays, layout, &fields, &stage)?;
+        register_patches(&mut sites, gray, layout, &fields, stage)?;
         ties.truncate(features);
         ties.extend(sites.iter().filter_map(|site| site.tie));
         stage.add(1)?;
-        solve(&mut fields, &ties, 3.0, &stage)?;
+        solve(&mut fields, &ties, 3.0, stage)?;
         stage.add(1)?;
     }
     for (field, placement) in fields.iter_mut().zip(&layout.placements) {
@@ -279,9 +299,29 @@ fn patch_sites(layout: &Layout, spacing: f64) -> Vec<PatchSite> {
 }
 
 /// Registers the patches at all sites, warped with the current fields, where the result may differ from the last one.
-fn register_patches(
+fn register_patches<G, E>(
     sites: &mut [PatchSite],
-    photos: &[GrayU8],
+    gray: &(impl Fn(usize) -> Result<G, E> + Sync),
+    layout: &Layout,
+    fields: &[DisplacementField],
+    stage: &Stage<'_>,
+) -> Result<(), E>
+where
+    G: Deref<Target = GrayU8> + Sync,
+    E: From<Cancelled> + Send,
+{
+    sites.par_chunk_by_mut(|a, b| (a.p, a.q) == (b.p, b.q)).try_for_each(|overlap| {
+        let Some(site) = overlap.first() else { return Ok(()) };
+        let photo = |k: usize| gray(layout.placements[k].photo);
+        let (first, second) = (photo(site.p)?, photo(site.q)?);
+        register_overlap(overlap, [&*first, &*second], layout, fields, stage).map_err(E::from)
+    })
+}
+
+/// Registers the patches of one overlap; `photos` are those of the two placements.
+fn register_overlap(
+    sites: &mut [PatchSite],
+    photos: [&GrayU8; 2],
     layout: &Layout,
     fields: &[DisplacementField],
     stage: &Stage<'_>,
@@ -302,10 +342,10 @@ fn register_patches(
             return Ok(());
         }
         (site.tie, site.registered_at) = (None, Some(apart));
-        let Some(first) = patch(photos, layout, &fields[p], p, c, PATCH_RADIUS) else { return Ok(()) };
+        let Some(first) = patch(photos[0], layout, &fields[p], p, c, PATCH_RADIUS) else { return Ok(()) };
         site.is_low_texture = corner_strength(&first) < MIN_CORNER_STRENGTH;
         if !site.is_low_texture
-            && let Some(second) = patch(photos, layout, &fields[q], q, c, PATCH_RADIUS + SEARCH_RADIUS)
+            && let Some(second) = patch(photos[1], layout, &fields[q], q, c, PATCH_RADIUS + SEARCH_RADIUS)
             && let Some(offset) = register(&first, second)
         {
             let other = c + offset;
@@ -317,7 +357,7 @@ fn register_patches(
 
 /// Samples a placement around a canvas pixel, side `2 radius + 1`; `None` where the patch is not completely inside the photograph.
 fn patch(
-    photos: &[GrayU8],
+    photo: &GrayU8,
     layout: &Layout,
     field: &DisplacementField,
     p: usize,
@@ -325,7 +365,6 @@ fn patch(
     radius: usize,
 ) -> Option<Vec<f32>> {
     let placement = &layout.placements[p];
-    let photo = photos.get(placement.photo)?;
     let to_pixel =
         |c: Point2<f64>| placement.view.project(&layout.surface.inverse(c - field.at(c) + placement.origin.coords));
     // The map is affine to first order over a patch.

@@ -20,14 +20,14 @@ mod warp;
 
 pub use bounds::Bounds;
 pub(crate) use correlation::{PAD, SEARCH_RADIUS, SEARCH_SIDE, Template};
-pub(crate) use crop::largest_rectangle;
+pub(crate) use crop::{largest_rectangle, largest_rectangle_of};
 pub(crate) use displacement::DisplacementField;
 pub use displacement::PhotoMap;
-pub(crate) use elastic::displacements;
+pub(crate) use elastic::{ROUND_UNITS, displacements, displacements_with};
 pub use framing::Framing;
 pub use layout::{Canvas, LayoutError};
 pub(crate) use layout::{Layout, Placement, layout};
-pub(crate) use preview::{Piece, Preview, downsample_box, downsampled_view};
+pub(crate) use preview::{Piece, Preview, PreviewScale, downsample_box, downsampled_view};
 pub use warp::WarpedPhoto;
 pub(crate) use warp::{CLIPPED, Map, WarpSettings, warp};
 

@@ -60,6 +60,24 @@ impl Piece {
     }
 }
 
+/// Scale of a preview.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct PreviewScale {
+    /// Canvas pixels per preview pixel.
+    pub(crate) step: usize,
+    /// Factor by which photographs are downsampled first, against aliasing.
+    pub(crate) shrink: usize,
+}
+
+impl PreviewScale {
+    /// Returns the scale of a preview of about `max_pixels` pixels at most.
+    pub(crate) fn new(layout: &Layout, resolution: f64, max_pixels: usize) -> Self {
+        let ratio = (layout.width as f64 * layout.height as f64 / max_pixels.max(1) as f64).sqrt();
+        let step = (ratio.ceil() as usize).max(1);
+        Self { step, shrink: ((step as f64 / resolution.max(1e-9)).round() as usize).max(1) }
+    }
+}
+
 impl Preview {
     /// Warps all placements to a preview of about `max_pixels` pixels at most.
     pub(crate) fn draw(
@@ -71,13 +89,7 @@ impl Preview {
         progress: &dyn Progress,
     ) -> Result<Self, Cancelled> {
         let stage = Stage::new(progress, "preview", photos.len() + layout.placements.len())?;
-        let ratio = (layout.width as f64 * layout.height as f64 / max_pixels.max(1) as f64).sqrt();
-        let step = (ratio.ceil() as usize).max(1);
-        let s = 1.0 / step as f64;
-        let surface = Surface { scale: layout.surface.scale * s, ..layout.surface };
-        let (width, height) = (layout.width.div_ceil(step), layout.height.div_ceil(step));
-        // Box filter against aliasing.
-        let shrink = ((step as f64 / resolution.max(1e-9)).round() as usize).max(1);
+        let PreviewScale { shrink, .. } = PreviewScale::new(layout, resolution, max_pixels);
         let small = |(i, photo): (usize, &ImageView<'_, u8, 3>)| {
             let is_placed = layout.placements.iter().any(|p| p.photo == i);
             let small = is_placed.then(|| downsample_box(*photo, shrink, &stage)).transpose()?;
@@ -85,6 +97,20 @@ impl Preview {
             Ok(small)
         };
         let small: Vec<Option<RgbU8>> = photos.par_iter().enumerate().map(small).collect::<Result<_, Cancelled>>()?;
+        Self::draw_small(&small, layout, fields, PreviewScale::new(layout, resolution, max_pixels), &stage)
+    }
+
+    /// As [`Preview::draw`], of photographs downsampled by [`PreviewScale::shrink`]; `None` for those that are not placed.
+    pub(crate) fn draw_small(
+        small: &[Option<RgbU8>],
+        layout: &Layout,
+        fields: &[Option<DisplacementField>],
+        PreviewScale { step, shrink }: PreviewScale,
+        stage: &Stage<'_>,
+    ) -> Result<Self, Cancelled> {
+        let s = 1.0 / step as f64;
+        let surface = Surface { scale: layout.surface.scale * s, ..layout.surface };
+        let (width, height) = (layout.width.div_ceil(step), layout.height.div_ceil(step));
         let draw = |(k, p): (usize, &Placement)| {
             let Some(Some(photo)) = small.get(p.photo) else { return Ok(None) };
             // The surface origin is canvas position −origin.
@@ -100,7 +126,7 @@ impl Preview {
             let small = Placement { view, bounds, origin, ..*p };
             let settings =
                 WarpSettings { displacement: field.as_ref(), interpolation: Interpolation::Bilinear, correction: None };
-            let warped = warp(photo.view(), &small, &surface, bounds, settings, &stage)?;
+            let warped = warp(photo.view(), &small, &surface, bounds, settings, stage)?;
             let (eccentricity, radius) = distances(&small, &surface);
             stage.add(1)?;
             let pixels = warped.pixels.as_slice().as_chunks::<4>().0.iter();

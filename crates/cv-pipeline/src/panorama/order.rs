@@ -2,7 +2,7 @@
 
 use crate::panorama::{LeftOut, PanoramaError, PanoramaImage, PanoramaPair, PanoramaResult};
 use cv_core::{Correspondence, DMatch, ImageView};
-use cv_panorama::{AlignedPair, Alignment, PhotoSample};
+use cv_panorama::{AlignedPair, Alignment, PhotoSample, RenderError, StreamError};
 
 /// A permutation of photographs.
 pub(super) struct Order {
@@ -19,15 +19,14 @@ impl Order {
     /// Sorts photographs by size and by a hash of their pixels, rounded to 8 bits: the order, and with it the choice
     /// between equally good solutions, does not depend on the bit depth. O(pixels / 16) unless photographs are alike.
     pub(super) fn of<T: PhotoSample>(photos: &[ImageView<'_, T, 3>]) -> Self {
-        let rounded = |v: T| (v.to_f32() * (255.0 / T::WHITE.to_f32())).round() as u64;
-        let exact = |v: T| v.to_f32() as u64;
-        let sparse: Vec<u64> = photos.iter().map(|photo| hash(photo, ROW_STEP, rounded)).collect();
-        let mut inputs: Vec<usize> = (0..photos.len()).collect();
-        inputs.sort_by(|&a, &b| {
-            let whole = |value: &dyn Fn(T) -> u64| hash(&photos[a], 1, value).cmp(&hash(&photos[b], 1, value));
-            let by_rows = photos[a].size().cmp(&photos[b].size()).then(sparse[a].cmp(&sparse[b]));
-            by_rows.then_with(|| whole(&rounded)).then_with(|| whole(&exact))
-        });
+        let sparse: Vec<_> = photos.iter().map(|photo| (photo.size(), sparse_hash(photo))).collect();
+        Self::by(&sparse, |index| whole_hashes(&photos[index]))
+    }
+
+    /// As [`Order::of`], of photographs by size and [`sparse_hash`]; `whole` returns the [`whole_hashes`] of one, where these are equal.
+    pub(super) fn by(sparse: &[((usize, usize), u64)], whole: impl Fn(usize) -> [u64; 2]) -> Self {
+        let mut inputs: Vec<usize> = (0..sparse.len()).collect();
+        inputs.sort_by(|&a, &b| sparse[a].cmp(&sparse[b]).then_with(|| whole(a).cmp(&whole(b))));
         let mut canonical = vec![0; inputs.len()];
         inputs.iter().enumerate().for_each(|(k, &i)| canonical[i] = k);
         Self { inputs, canonical }
@@ -85,8 +84,16 @@ impl Order {
             PanoramaError::Align { source, images } => {
                 PanoramaError::Align { source, images: self.restored_images(images) }
             }
+            PanoramaError::Render(RenderError::Stream(StreamError::Photograph { index })) => {
+                RenderError::from(StreamError::Photograph { index: self.inputs[index] }).into()
+            }
             other => other,
         }
+    }
+
+    /// Returns the input index of each photograph in canonical order.
+    pub(super) fn inputs(&self) -> &[usize] {
+        &self.inputs
     }
 
     fn restored_pair(&self, mut pair: PanoramaPair) -> PanoramaPair {
@@ -99,6 +106,20 @@ impl Order {
         }
         pair
     }
+}
+
+/// Hashes every [`ROW_STEP`]-th row, rounded to 8 bits.
+pub(super) fn sparse_hash<T: PhotoSample>(photo: &ImageView<'_, T, 3>) -> u64 {
+    hash(photo, ROW_STEP, rounded)
+}
+
+/// Hashes all samples, rounded to 8 bits and exactly.
+pub(super) fn whole_hashes<T: PhotoSample>(photo: &ImageView<'_, T, 3>) -> [u64; 2] {
+    [hash(photo, 1, rounded), hash(photo, 1, |v: T| v.to_f32() as u64)]
+}
+
+fn rounded<T: PhotoSample>(v: T) -> u64 {
+    (v.to_f32() * (255.0 / T::WHITE.to_f32())).round() as u64
 }
 
 /// Returns the FNV-1a hash of the values of the samples in every `step`-th row.

@@ -23,22 +23,27 @@ pub(super) struct Registered {
 
 /// Registers photographs by their features.
 pub(super) fn register(
-    photos: &[PanoramaPhoto<'_>],
+    photos: &dyn Photographs,
     options: &PanoramaOptions,
     progress: &dyn Progress,
 ) -> Result<Registered, PanoramaError> {
     let mut clock = StageClock::new();
-    let n = photos.len();
+    let n = photos.count();
+    let indices: Vec<usize> = (0..n).collect();
     let candidates: Vec<(usize, usize)> = (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b))).collect();
     let mut extract_and_match =
-        |matching: &MatchingOptions| -> Result<(Vec<Prepared>, Vec<Option<MatchedPair>>), Cancelled> {
+        |matching: &MatchingOptions| -> Result<(Vec<Prepared>, Vec<Option<MatchedPair>>), PanoramaError> {
             let stage = Stage::new(progress, "features", n)?;
-            let extract = |p| -> Result<Prepared, Cancelled> {
-                let prepared = Prepared::new(p, matching, options.registration_pixels, &stage)?;
+            let extract = |&index: &usize| -> Result<Prepared, PanoramaError> {
+                let prepare = |p: &PanoramaPhoto<'_>| Prepared::new(p, matching, options.registration_pixels, &stage);
+                let prepared = photos.prepare(index, &prepare)?;
                 stage.add(1)?;
                 Ok(prepared)
             };
-            let prepared: Vec<Prepared> = photos.par_iter().map(extract).collect::<Result<_, _>>()?;
+            let mut prepared: Vec<Prepared> = Vec::with_capacity(n);
+            for batch in indices.chunks(photos.at_once()) {
+                prepared.extend(batch.par_iter().map(extract).collect::<Result<Vec<_>, _>>()?);
+            }
             clock.lap("features");
             let stage = Stage::new(progress, "match", candidates.len())?;
             let compare = |&(a, b): &(usize, usize)| -> Result<Option<MatchedPair>, Cancelled> {
@@ -46,7 +51,7 @@ pub(super) fn register(
                 stage.add(1)?;
                 Ok(pair)
             };
-            let matched = candidates.par_iter().map(compare).collect::<Result<_, _>>()?;
+            let matched = candidates.par_iter().map(compare).collect::<Result<_, Cancelled>>()?;
             clock.lap("match");
             Ok((prepared, matched))
         };
@@ -78,7 +83,7 @@ pub(super) fn register(
         prepared.iter_mut().map(|p| std::mem::replace(&mut p.gray, GrayU8::new(0, 0, [0]))).collect();
     let alignment = refine_alignment(&grays, &known, &verified, alignment, &options.align, progress)?;
     let mut images = describe(&prepared, &alignment.views, &pairs);
-    let sizes: Vec<_> = prepared.iter().zip(photos).map(|(p, photo)| (p.factor, photo.image.size())).collect();
+    let sizes: Vec<_> = prepared.iter().enumerate().map(|(index, p)| (p.factor, photos.size(index))).collect();
     for (image, (_, size)) in images.iter_mut().zip(&sizes) {
         image.size = *size;
     }
@@ -88,8 +93,42 @@ pub(super) fn register(
     Ok(Registered { alignment, images, pairs, features, clock })
 }
 
+/// A function of a photograph that extracts its features.
+pub(super) type Prepare<'a> = dyn Fn(&PanoramaPhoto<'_>) -> Result<Prepared, Cancelled> + 'a;
+
+/// Photographs to register, in memory or loaded one after the other.
+pub(super) trait Photographs: Sync {
+    fn count(&self) -> usize;
+
+    fn size(&self, index: usize) -> (usize, usize);
+
+    /// Number of photographs that may be in memory at a time.
+    fn at_once(&self) -> usize;
+
+    /// Calls `prepare` with a photograph.
+    fn prepare(&self, index: usize, prepare: &Prepare<'_>) -> Result<Prepared, PanoramaError>;
+}
+
+impl Photographs for Vec<PanoramaPhoto<'_>> {
+    fn count(&self) -> usize {
+        self.len()
+    }
+
+    fn size(&self, index: usize) -> (usize, usize) {
+        self[index].image.size()
+    }
+
+    fn at_once(&self) -> usize {
+        self.len().max(1)
+    }
+
+    fn prepare(&self, index: usize, prepare: &Prepare<'_>) -> Result<Prepared, PanoramaError> {
+        Ok(prepare(&self[index])?)
+    }
+}
+
 /// A photograph with its features.
-struct Prepared {
+pub(super) struct Prepared {
     /// In pixels of the resized photograph.
     photo: Photo,
     /// Size of the photograph relative to the resized one.

@@ -42,7 +42,7 @@ pub(super) fn write<T: PhotoSample>(
 ) -> Result<(), Failure> {
     let text = if is_pto(path) {
         let names: Vec<String> = photographs.iter().map(|photo| path_in_project(path, photo)).collect();
-        let made = result.registration(&names)?.to_pto(&result.canvas, result.image.size());
+        let made = result.registration(&names)?.to_pto(&result.canvas, result.size);
         let made = made.during(path.display()).advice("a file that ends in .json")?;
         warn_of_lens_error(path, made.lens_error_px, context);
         made.content

@@ -11,24 +11,26 @@ use std::path::PathBuf;
 /// Maximum number of pairs whose matches are drawn.
 const MAX_DRAWN_PAIRS: usize = 12;
 
-/// Builds the page: the panorama, its seams, the outcome of each photograph and the matches of each overlap. `pictures` are the photographs and, last, the panorama.
+/// Builds the page: the panorama, its seams, the outcome of each photograph and the matches of each overlap. `pictures` are the photographs and, last, the panorama, of any resolution, and `labels`
+/// those of that panorama.
 pub(super) fn report<T>(
     paths: &[PathBuf],
     pictures: &[ImageView<'_, u8, 3>],
+    labels: ImageView<'_, u16, 1>,
     result: &PanoramaResult<T>,
 ) -> Result<Report, Failure> {
     let image = pictures[paths.len()];
     let name = |i: usize| paths[i].file_name().unwrap_or_default().to_string_lossy().into_owned();
     let used = result.images.iter().filter(|image| image.used).count();
-    let (width, height) = image.size();
+    let (width, height) = result.size;
     let mut page = Report::new("Panorama");
     page.headline("photographs used", &format!("{used} of {}", paths.len()))
         .headline("size", &format!("{width}×{height}"))
         .headline("residual of matches (RMS)", &format!("{:.2} px", result.reprojection_rms_px));
     let caption = format!("{} projection; black where no photograph reaches.", result.canvas.projection);
     page.section("Panorama").figure(picture(&image.to_image(), Width::Full, &caption)?);
-    let sources = RgbU8::from_fn(width, height, |x, y| {
-        let label = result.labels.at(x, y)[0];
+    let sources = RgbU8::from_fn(image.width(), image.height(), |x, y| {
+        let label = labels.at(x, y)[0];
         if label == u16::MAX { [0; 3] } else { tint(image.at(x, y), label) }
     });
     let caption = "Source photograph of each pixel; seams are where the color changes.";
@@ -52,13 +54,13 @@ pub(super) fn report<T>(
     for pair in accepted.take(MAX_DRAWN_PAIRS) {
         let (photo_a, photo_b) = (pictures[pair.a], pictures[pair.b]);
         let (a, b) = (shrink_to_fit(photo_a, 700), shrink_to_fit(photo_b, 700));
-        let at = |p: Point2<f64>, photo: ImageView<'_, u8, 3>, small: &RgbU8| {
-            Scaling::between(photo.size(), small.size()).point(p)
+        let at = |p: Point2<f64>, photo: usize, small: &RgbU8| {
+            Scaling::between(result.images[photo].size, small.size()).point(p)
         };
         let matches: Vec<Correspondence> = result
             .correspondences(pair)
             .iter()
-            .map(|m| Correspondence { a: at(m.a, photo_a, &a), b: at(m.b, photo_b, &b) })
+            .map(|m| Correspondence { a: at(m.a, pair.a, &a), b: at(m.b, pair.b, &b) })
             .collect();
         let mut agree = vec![false; matches.len()];
         pair.inliers.iter().for_each(|&i| agree[i] = true);

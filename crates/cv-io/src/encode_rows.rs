@@ -1,0 +1,293 @@
+//! Writing images row by row, without the whole image in memory.
+
+use crate::encode::{JPEG_QUALITY, Parts, PngPixels, encode_jpeg_rows, png_writer, push_ycbcr};
+use crate::encode_tiff::{TiffLayout, TiffPosition, TiffWriter};
+use crate::files::write_atomic_file;
+use crate::{FormatError, IoError, Metadata};
+use jpeg_encoder::JpegColorType;
+use png::{BitDepth, ColorType};
+use std::fs::File;
+use std::io::{self, BufReader, BufWriter, Read, Seek, Write};
+use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+
+/// Bytes of compressed data per PNG chunk.
+const PNG_CHUNK_BYTES: usize = 1 << 18;
+/// Bytes of the buffer in front of the file.
+const BUFFER_BYTES: usize = 1 << 18;
+
+type Sink = BufWriter<File>;
+
+/// Receives an image row by row; see [`write_image_rows`].
+pub struct RowWriter<'a> {
+    path: &'a Path,
+    metadata: Metadata,
+    position: Option<TiffPosition>,
+    file: Option<File>,
+    /// Width and height; height counts the rows that are still to come.
+    size: Option<(usize, usize)>,
+    rows_left: usize,
+    encoder: Option<Encoder>,
+}
+
+enum Encoder {
+    Png(Box<png::StreamWriter<'static, Sink>>),
+    Tiff(Box<TiffWriter<Sink>>),
+    /// JPEG is encoded at the end, from the pixels in a temporary file.
+    Jpeg {
+        pixels: Sink,
+        file: File,
+    },
+}
+
+fn png_error(error: png::EncodingError) -> FormatError {
+    match error {
+        png::EncodingError::IoError(error) => FormatError::Os(error),
+        error => FormatError::corrupt("PNG", error.to_string()),
+    }
+}
+
+impl RowWriter<'_> {
+    /// Sets the metadata; before the first rows.
+    pub fn set_metadata(&mut self, metadata: Metadata) {
+        self.metadata = metadata;
+    }
+
+    /// Sets the position of the top left pixel in a larger canvas, in pixels, and the size of that canvas; before the first rows. TIFF has it in the fields XPosition
+    /// and YPosition (TIFF 6.0, section 12) in units of the resolution, as Hugin's and PTGui's cropped TIFF files; other formats drop it.
+    pub fn set_position(&mut self, (left, top): (usize, usize), (canvas_width, canvas_height): (usize, usize)) {
+        let [left, top, width, height] = [left, top, canvas_width, canvas_height].map(|v| v as u32);
+        self.position = Some(TiffPosition { left, top, width, height });
+    }
+
+    /// Sets the size in pixels; before the first rows.
+    pub fn set_size(&mut self, width: usize, height: usize) {
+        (self.size, self.rows_left) = (Some((width, height)), height);
+    }
+
+    /// Writes the next rows, of the width of the image and always the same pixel type.
+    ///
+    /// # Errors
+    /// [`FormatError`]: the format cannot hold the image, the rows do not fit the size, or [`FormatError::Os`].
+    pub fn write(&mut self, rows: impl PngPixels) -> Result<(), FormatError> {
+        self.write_parts(rows.parts())
+    }
+
+    fn write_parts(&mut self, (width, rows, color, depth, bytes): Parts) -> Result<(), FormatError> {
+        let wrong = || FormatError::corrupt("image", format!("{width}×{rows} more pixels do not fit its size"));
+        let size = self.size.filter(|size| size.0 == width && rows <= self.rows_left).ok_or_else(wrong)?;
+        self.rows_left -= rows;
+        if let Some(file) = self.file.take() {
+            self.encoder = Some(self.encoder_for(file, size, color, depth)?);
+        }
+        match &mut self.encoder {
+            Some(Encoder::Png(writer)) => Ok(writer.write_all(&bytes)?),
+            Some(Encoder::Tiff(writer)) => writer.write(&bytes),
+            Some(Encoder::Jpeg { pixels, .. }) => Ok(pixels.write_all(&bytes)?),
+            None => Ok(()),
+        }
+    }
+
+    fn encoder_for(
+        &self,
+        file: File,
+        (width, height): (usize, usize),
+        color: ColorType,
+        depth: BitDepth,
+    ) -> Result<Encoder, FormatError> {
+        let refused = |format, what| FormatError::NotRepresentable { format, what };
+        let too_large = |format| refused(format, format!("an image of {width}×{height}"));
+        let extension = self.path.extension().map(|e| e.to_string_lossy().to_lowercase());
+        match extension.as_deref() {
+            Some("png") => {
+                let side = |n: usize| u32::try_from(n).ok().filter(|&n| n > 0 && n <= i32::MAX as u32);
+                let (Some(w), Some(h)) = (side(width), side(height)) else { return Err(too_large("PNG")) };
+                let sink = BufWriter::with_capacity(BUFFER_BYTES, file);
+                let writer = png_writer(sink, (w, h), (color, depth), &self.metadata, None).map_err(png_error)?;
+                let writer = writer.into_stream_writer_with_size(PNG_CHUNK_BYTES).map_err(png_error)?;
+                Ok(Encoder::Png(Box::new(writer)))
+            }
+            Some("tif" | "tiff") => {
+                let depth = if depth == BitDepth::Sixteen { 2 } else { 1 };
+                let layout = TiffLayout::new(width, height, color.samples(), depth)?;
+                let sink = BufWriter::with_capacity(BUFFER_BYTES, file);
+                Ok(Encoder::Tiff(Box::new(TiffWriter::new(sink, layout, &self.metadata, self.position)?)))
+            }
+            Some("jpg" | "jpeg") if depth == BitDepth::Eight && color == ColorType::Rgb => {
+                if width.max(height) > usize::from(u16::MAX) || width * height == 0 {
+                    return Err(too_large("JPEG"));
+                }
+                let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty());
+                let pixels = tempfile::tempfile_in(folder.unwrap_or(Path::new(".")))?;
+                Ok(Encoder::Jpeg { pixels: BufWriter::with_capacity(BUFFER_BYTES, pixels), file })
+            }
+            Some("jpg" | "jpeg") => Err(refused("JPEG", "anything but colors of 8 bits, row by row".to_owned())),
+            _ => Err(FormatError::unsupported(
+                "the file name",
+                "an extension other than .png, .tif, .tiff, .jpg and .jpeg",
+            )),
+        }
+    }
+
+    fn finish(self) -> Result<(), FormatError> {
+        if self.rows_left > 0 || self.encoder.is_none() {
+            return Err(FormatError::corrupt("image", format!("{} rows are missing", self.rows_left)));
+        }
+        match self.encoder {
+            Some(Encoder::Png(writer)) => writer.finish().map_err(png_error),
+            Some(Encoder::Tiff(writer)) => writer.finish(),
+            Some(Encoder::Jpeg { pixels, file }) => {
+                let (width, height) = self.size.unwrap_or_default();
+                let mut pixels = pixels.into_inner().map_err(io::IntoInnerError::into_error)?;
+                pixels.rewind()?;
+                let failure = Mutex::new(None);
+                let rows = SpooledRows {
+                    size: (width as u16, height as u16),
+                    pixels: Mutex::new((BufReader::with_capacity(BUFFER_BYTES, pixels), vec![0; 3 * width], None)),
+                    failure: &failure,
+                };
+                let mut sink = BufWriter::with_capacity(BUFFER_BYTES, file);
+                encode_jpeg_rows(&mut sink, rows, 3, JPEG_QUALITY, &self.metadata)?;
+                sink.flush()?;
+                failure.into_inner().unwrap_or_else(PoisonError::into_inner).map_or(Ok(()), |e| Err(FormatError::Os(e)))
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+/// RGB rows for the JPEG encoder, read from a file from the top.
+struct SpooledRows<'a> {
+    size: (u16, u16),
+    /// The file, the last row that was read, and its index.
+    pixels: Mutex<(BufReader<File>, Vec<u8>, Option<u16>)>,
+    failure: &'a Mutex<Option<io::Error>>,
+}
+
+impl jpeg_encoder::ImageBuffer for SpooledRows<'_> {
+    fn get_jpeg_color_type(&self) -> JpegColorType {
+        JpegColorType::Ycbcr
+    }
+
+    fn width(&self) -> u16 {
+        self.size.0
+    }
+
+    fn height(&self) -> u16 {
+        self.size.1
+    }
+
+    fn fill_buffers(&self, y: u16, buffers: &mut [Vec<u8>; 4]) {
+        let mut pixels = self.pixels.lock().unwrap_or_else(PoisonError::into_inner);
+        let (file, row, last) = &mut *pixels;
+        // Rows come in order; the last one is repeated to whole blocks.
+        if *last != Some(y) {
+            if let Err(error) = file.read_exact(row) {
+                self.failure.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+            }
+            *last = Some(y);
+        }
+        push_ycbcr(row, buffers);
+    }
+}
+
+/// Writes an image row by row, in the format of the file name's extension: `.png`, `.tif` or `.tiff`, or `.jpg` or `.jpeg` (8-bit colors). The file appears when
+/// `write` has succeeded, as by [`write_atomic`](crate::write_atomic).
+///
+/// # Errors
+/// Whatever `write` fails with; [`IoError`] as for [`write_image`](crate::write_image), and where rows are missing.
+pub fn write_image_rows<R, E: From<IoError>>(
+    path: impl AsRef<Path>,
+    write: impl FnOnce(&mut RowWriter<'_>) -> Result<R, E>,
+) -> Result<R, E> {
+    let path = path.as_ref();
+    let (mut write, mut outcome) = (Some(write), None);
+    let mut content = |file: File| -> Result<(), FormatError> {
+        let mut rows = RowWriter {
+            path,
+            metadata: Metadata::default(),
+            position: None,
+            file: Some(file),
+            size: None,
+            rows_left: 0,
+            encoder: None,
+        };
+        let Some(write) = write.take() else { return Ok(()) };
+        let result = write(&mut rows);
+        let is_written = result.is_ok();
+        outcome = Some(result);
+        // The temporary file is removed.
+        if is_written { rows.finish() } else { Err(io::Error::other("it was not finished").into()) }
+    };
+    let written = write_atomic_file(path, &mut content);
+    match (outcome, written) {
+        (Some(Err(error)), _) => Err(error),
+        (_, Err(reason)) => Err(IoError::writing(path, reason).into()),
+        (Some(Ok(result)), Ok(())) => Ok(result),
+        (None, Ok(())) => Err(IoError::writing(path, FormatError::Empty).into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{read_image, write_image};
+    use cv_core::Image;
+
+    #[test]
+    fn files_are_those_of_the_whole_image_and_absent_after_a_failure() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        let colors = Image::<u8, 3>::from_fn(701, 333, |x, y| [(x % 251) as u8, (y % 241) as u8, (x * y % 239) as u8]);
+        let deep = colors.map(|p| p.map(|v| 257 * u16::from(v) + 3));
+        let alpha = colors.map(|[r, g, b]| [r, g, b, r / 128 * 255]);
+        // Strips of any height.
+        macro_rules! in_rows {
+            ($name:expr, $image:expr) => {
+                write_image_rows(path($name), |rows| -> Result<(), IoError> {
+                    let (w, h) = $image.size();
+                    rows.set_size(w, h);
+                    for top in (0..h).step_by(50) {
+                        let part = $image.view().crop(0, top, w, 50.min(h - top)).unwrap();
+                        rows.write(part).map_err(|reason| IoError::writing(Path::new($name), reason))?;
+                    }
+                    Ok(())
+                })
+            };
+        }
+        macro_rules! compare {
+            ($ending:expr, $image:expr) => {
+                in_rows!(concat!("rows.", $ending), $image).unwrap();
+                write_image(path(concat!("whole.", $ending)), $image.view(), &Metadata::default()).unwrap();
+                let (a, b) = (path(concat!("rows.", $ending)), path(concat!("whole.", $ending)));
+                assert_eq!(read_image(&a).unwrap().pixels, read_image(&b).unwrap().pixels, $ending);
+                // PNG is compressed in another way.
+                assert!($ending == "png" || std::fs::read(a).unwrap() == std::fs::read(b).unwrap(), $ending);
+            };
+        }
+        compare!("png", colors);
+        compare!("tif", colors);
+        compare!("jpg", colors);
+        compare!("png", deep);
+        compare!("tif", deep);
+        compare!("tif", alpha);
+        let tiny = Image::<u8, 3>::new(1, 1, [7, 8, 9]);
+        compare!("tif", tiny);
+        compare!("png", tiny);
+        let error = in_rows!("deep.jpg", deep).unwrap_err();
+        assert!(matches!(error.reason, FormatError::NotRepresentable { format: "JPEG", .. }), "{error}");
+        let short = write_image_rows(path("short.png"), |rows| -> Result<(), IoError> {
+            rows.set_size(701, 334);
+            rows.write(colors.view()).map_err(|reason| IoError::writing(Path::new("short.png"), reason))
+        });
+        assert!(short.unwrap_err().to_string().contains("1 rows are missing"));
+        for (size, rows) in [((700, 333), "width"), ((701, 300), "height")] {
+            let wrong = write_image_rows(path("wrong.tif"), |writer| -> Result<(), IoError> {
+                writer.set_size(size.0, size.1);
+                writer.write(colors.view()).map_err(|reason| IoError::writing(Path::new("wrong.tif"), reason))
+            });
+            assert!(matches!(wrong.unwrap_err().reason, FormatError::Corrupt { .. }), "{rows}");
+        }
+        assert!(["deep.jpg", "short.png", "wrong.tif"].iter().all(|name| !path(name).exists()));
+    }
+}
