@@ -3,13 +3,14 @@
 //! Feature positions have errors of some tenths of a pixel, from the scale space they are detected in. Around each inlier a patch of one photograph is registered to the
 //! other, with a gain and an offset for exposure differences, which is accurate to some hundredths; the bundle adjustment is then repeated.
 
-use crate::align::{AlignError, AlignOptions, Alignment, Photo, View, align};
+use crate::align::{AlignError, AlignOptions, Alignment, Photo, View, align_weighted};
 use cv_core::{Cancelled, Correspondence, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
 use cv_geometry::VerifiedPair;
 use cv_imgproc::bicubic_at;
 use fearless_simd::{Level, dispatch};
 use nalgebra::{SMatrix, SVector};
 use rayon::prelude::*;
+use std::collections::HashSet;
 
 /// Patch radius in pixels.
 const RADIUS: usize = 9;
@@ -17,6 +18,12 @@ const RADIUS: usize = 9;
 const SIDE: usize = 2 * RADIUS + 1;
 /// Side of a patch with a margin of one pixel for gradients.
 const WIDE: usize = SIDE + 2;
+/// Pixels of a row whose products are summed at once.
+const LANES: usize = 8;
+/// Pixels of a row of a patch in whole vectors; those beyond [`SIDE`] are ignored.
+const PADDED: usize = SIDE.next_multiple_of(LANES);
+/// Row stride of a warped patch: whole vectors and the margin.
+const STRIDE: usize = PADDED + 2;
 /// Maximum number of patches per pair, and per photograph if it has several pairs.
 const MAX_PATCHES: usize = 300;
 /// Scale of the loss relative to that of features, without parallax.
@@ -35,6 +42,8 @@ const MAX_CORRECTION_PX: f64 = 2.0;
 const MIN_CORRELATION: f64 = 0.7;
 /// Maximum standard error of a registered position along either axis, in pixels, estimated from the residuals of the patch.
 const MAX_STANDARD_ERROR_PX: f64 = 0.1;
+/// Standard deviation, in pixels, of a registered position from interpolation and what the warp and the linear offset leave out: added to its standard error.
+const MODEL_SIGMA_PX: f64 = 0.03;
 /// Minimum smaller eigenvalue of the structure tensor of a patch: with noise of a gray level the standard error is the maximum.
 const MIN_CORNER_STRENGTH: f64 = 1.0;
 /// Level from which on a pixel is clipped.
@@ -55,33 +64,40 @@ pub fn refine_alignment(
     progress: &dyn Progress,
 ) -> Result<Alignment, Cancelled> {
     let stage = Stage::new(progress, "align", 0)?;
+    let level = Level::new();
     let used = alignment.used().count();
     let count = (MAX_PATCHES * used / alignment.pairs.len().max(1)).min(MAX_PATCHES);
-    let refine = |pair: &VerifiedPair| -> Result<Option<VerifiedPair>, Cancelled> {
+    let view = |i: usize| alignment.views.get(i).and_then(|v| v.as_ref().ok());
+    let aligned: HashSet<(usize, usize)> = alignment.pairs.iter().map(|p| (p.a, p.b)).collect();
+    let refine = |pair: &VerifiedPair| -> Result<Option<(VerifiedPair, Vec<f64>)>, Cancelled> {
         stage.check()?;
-        let view = |i: usize| alignment.views.get(i).and_then(|v| v.as_ref().ok());
-        let is_used = alignment.pairs.iter().any(|p| (p.a, p.b) == (pair.a, pair.b));
+        let is_used = aligned.contains(&(pair.a, pair.b));
         let (Some(from), Some(to), true) = (view(pair.a), view(pair.b), is_used) else { return Ok(None) };
         let (Some(first), Some(second)) = (images.get(pair.a), images.get(pair.b)) else { return Ok(None) };
         let candidates = candidates(pair, from, to, count);
-        let refined = candidates.iter().filter_map(|m| refine_match(first, second, from, to, m));
-        let matches: Vec<Correspondence> = refined.collect();
+        let tone = tone_map(first, second, from, to);
+        let refined = candidates.iter().filter_map(|m| refine_match(level, (first, &tone), second, from, to, m));
+        let (matches, weights): (Vec<Correspondence>, Vec<f64>) = refined.unzip();
         if matches.len() < MIN_MATCHES {
-            return Ok(Some(pair.clone()));
+            return Ok(Some((pair.clone(), vec![weight_of(MAX_STANDARD_ERROR_PX); pair.matches.len()])));
         }
-        Ok(Some(VerifiedPair { inliers: (0..matches.len()).collect(), matches, ..pair.clone() }))
+        Ok(Some((VerifiedPair { inliers: (0..matches.len()).collect(), matches, ..pair.clone() }, weights)))
     };
-    let refined: Vec<Option<VerifiedPair>> = pairs.par_iter().map(refine).collect::<Result<_, _>>()?;
-    let refined: Vec<VerifiedPair> = refined.into_iter().flatten().collect();
+    let refined: Vec<Option<_>> = pairs.par_iter().map(refine).collect::<Result<_, _>>()?;
+    let (refined, weights): (Vec<VerifiedPair>, Vec<Vec<f64>>) = refined.into_iter().flatten().unzip();
     // Without parallax, residuals are those of the registration, and a narrow loss rejects what moved.
     let has_parallax = alignment.median_px > MAX_MEDIAN_RATIO * options.outlier_px;
     let outlier_px = options.outlier_px * if has_parallax { 1.0 } else { NARROW_LOSS_RATIO };
     let options = AlignOptions { motion: alignment.motion, outlier_px, ..*options };
     // The focal lengths found are where the search for better ones starts.
-    let focal = |i: usize| alignment.views.get(i).and_then(|v| v.as_ref().ok()).map(|v| v.camera.fx);
-    let photos: Vec<Photo> =
-        photos.iter().enumerate().map(|(i, p)| Photo { focal: focal(i).or(p.focal), ..*p }).collect();
-    let mut found = match align(&photos, &refined, &options, progress) {
+    let photos: Vec<Photo> = photos
+        .iter()
+        .enumerate()
+        .map(|(i, p)| Photo { focal: view(i).map(|v| v.camera.fx).or(p.focal), ..*p })
+        .collect();
+    // With parallax the matches differ by more than their standard errors.
+    let weights = if has_parallax { &[][..] } else { &weights };
+    let mut found = match align_weighted(&photos, &refined, weights, &options, progress) {
         Ok(found) => found,
         Err(AlignError::Cancelled(stop)) => return Err(stop),
         Err(_) => return Ok(alignment),
@@ -94,6 +110,11 @@ pub fn refine_alignment(
     found.pairs = alignment.pairs;
     found.measure();
     Ok(found)
+}
+
+/// Returns the weight of the residuals of a match by its standard error, in pixels.
+fn weight_of(standard_error: f64) -> f64 {
+    MODEL_SIGMA_PX / standard_error.hypot(MODEL_SIGMA_PX)
 }
 
 /// Positions where patches are registered: `count` at most, half of them at features, the others on a grid over the overlap.
@@ -124,8 +145,55 @@ fn keep_reasons(
     views.into_iter().zip(&alignment.views).map(|(new, old)| old.and(new)).collect()
 }
 
-/// Registers the patch around `m.a` to the second photograph; `None` where that fails: low texture, clipped pixels, low correlation, no convergence.
-fn refine_match(first: &GrayU8, second: &GrayU8, from: &View, to: &View, m: &Correspondence) -> Option<Correspondence> {
+/// Spacing, in pixels, of the samples of a tone map.
+const TONE_SPACING: usize = 4;
+/// Minimum number of samples of a tone map.
+const MIN_TONE_SAMPLES: u32 = 1000;
+
+/// Maps gray levels of the first photograph to those of the second by matching their histograms over the overlap; the identity where that is small. A camera's response makes another
+/// exposure more than a gain, which would move edges to one side.
+fn tone_map(first: &GrayU8, second: &GrayU8, from: &View, to: &View) -> [f32; 256] {
+    let (mut of_first, mut of_second) = ([0_u32; 256], [0_u32; 256]);
+    for y in (0..first.height()).step_by(TONE_SPACING) {
+        for x in (0..first.width()).step_by(TONE_SPACING) {
+            let seen = from.ray(Point2::new(x as f64, y as f64)).and_then(|ray| to.project(&ray));
+            if let Some(p) = seen.filter(|p| to.contains(*p))
+                && let Some([level]) = second.get(p.x.round().max(0.0) as usize, p.y.round().max(0.0) as usize)
+            {
+                of_first[usize::from(first.at(x, y)[0])] += 1;
+                of_second[usize::from(level)] += 1;
+            }
+        }
+    }
+    let mut map = std::array::from_fn(|v| v as f32);
+    if of_first.iter().sum::<u32>() < MIN_TONE_SAMPLES {
+        return map;
+    }
+    let (mut below, mut level, mut below_level) = (0.0_f32, 0, 0.0_f32);
+    for (count, to) in of_first.iter().zip(&mut map) {
+        // The middle of a level's samples.
+        let rank = below + 0.5 * *count as f32;
+        below += *count as f32;
+        while level < 255 && below_level + (of_second[level] as f32) < rank {
+            below_level += of_second[level] as f32;
+            level += 1;
+        }
+        // Samples are spread evenly over their level.
+        *to = level as f32 - 0.5 + ((rank - below_level) / (of_second[level].max(1)) as f32).clamp(0.0, 1.0);
+    }
+    map
+}
+
+/// Registers the patch around `m.a` to the second photograph, and returns the match and its weight; `None` where that fails: low texture, clipped pixels, low correlation,
+/// no convergence.
+fn refine_match(
+    level: Level,
+    (first, tone): (&GrayU8, &[f32; 256]),
+    second: &GrayU8,
+    from: &View,
+    to: &View,
+    m: &Correspondence,
+) -> Option<(Correspondence, f64)> {
     // At a pixel center, so that the template needs no interpolation.
     let (x, y) = (m.a.x.round(), m.a.y.round());
     let inside = |v: f64, n: usize| v >= RADIUS as f64 && v + RADIUS as f64 <= n as f64 - 1.0;
@@ -136,24 +204,25 @@ fn refine_match(first: &GrayU8, second: &GrayU8, from: &View, to: &View, m: &Cor
     let transfer = |p: Point2<f64>| to.project(&from.ray(p)?);
     let center = transfer(a)?;
     let warp = Warp::new(|i, j| transfer(a + Vector2::new(i, j)), center)?;
-    let template = first.view().crop(x as usize - RADIUS, y as usize - RADIUS, SIDE, SIDE)?;
-    if (0..SIDE).any(|row| template.row(row).iter().any(|v| *v >= CLIPPED)) || !has_texture(template) {
+    let pixels = first.view().crop(x as usize - RADIUS, y as usize - RADIUS, SIDE, SIDE)?;
+    if (0..SIDE).any(|row| pixels.row(row).iter().any(|v| *v >= CLIPPED)) || !has_texture(pixels) {
         return None;
     }
+    let template = Template::new(pixels, tone);
     let start = m.b + (center - transfer(m.a)?);
     let mut b = start;
-    let mut patch = [0.0_f32; WIDE * WIDE];
+    let mut patch = [0.0_f32; WIDE * STRIDE];
     for _ in 0..MAX_ITERATIONS {
-        if !sample(second, b, &warp, &mut patch) {
+        if !sample(level, second, b, &warp, &mut patch) {
             return None;
         }
-        let step = gauss_newton_step(template, &patch)?;
+        let (step, standard_error) = gauss_newton_step(level, &template, &patch)?;
         b += warp.x * step.x + warp.y * step.y;
         if (b - start).norm() > MAX_CORRECTION_PX {
             return None;
         }
         if step.norm() < TOLERANCE_PX {
-            return Some(Correspondence { a, b });
+            return Some((Correspondence { a, b }, weight_of(standard_error)));
         }
     }
     None
@@ -212,7 +281,7 @@ impl Warp {
 }
 
 /// Samples the warped patch around `b` with a margin of one pixel; false where it leaves the image.
-fn sample(image: &GrayU8, b: Point2<f64>, warp: &Warp, patch: &mut [f32; WIDE * WIDE]) -> bool {
+fn sample(level: Level, image: &GrayU8, b: Point2<f64>, warp: &Warp, patch: &mut [f32; WIDE * STRIDE]) -> bool {
     let h = (WIDE / 2) as f64;
     let (right, bottom) = (image.width() as f64 - 2.0, image.height() as f64 - 2.0);
     let is_inside = |p: Point2<f64>| p.x.is_finite() && p.x >= 1.0 && p.y >= 1.0 && p.x <= right && p.y <= bottom;
@@ -220,18 +289,18 @@ fn sample(image: &GrayU8, b: Point2<f64>, warp: &Warp, patch: &mut [f32; WIDE * 
         return false;
     }
     let b = b.coords.cast::<f32>();
-    dispatch!(Level::new(), _simd => sample_rows(image, b, warp, patch));
+    dispatch!(level, _simd => sample_rows(image, b, warp, patch));
     true
 }
 
 #[inline(always)]
-fn sample_rows(image: &GrayU8, b: Vector2<f32>, warp: &Warp, patch: &mut [f32; WIDE * WIDE]) {
+fn sample_rows(image: &GrayU8, b: Vector2<f32>, warp: &Warp, patch: &mut [f32; WIDE * STRIDE]) {
     let (right, bottom) = ((image.width() - 1) as f32, (image.height() - 1) as f32);
     let view = image.view();
     let offset = (WIDE / 2) as f32;
-    for (j, row) in patch.chunks_exact_mut(WIDE).enumerate() {
+    for (j, row) in patch.chunks_exact_mut(STRIDE).enumerate() {
         let [base, linear, square] = warp.row(j as f64 - f64::from(offset));
-        for (i, value) in row.iter_mut().enumerate() {
+        for (i, value) in row[..WIDE].iter_mut().enumerate() {
             let i = i as f32 - offset;
             let p = b + base + linear * i + square * (i * i);
             // Single-precision rounding stays within the image.
@@ -242,44 +311,177 @@ fn sample_rows(image: &GrayU8, b: Vector2<f32>, warp: &Warp, patch: &mut [f32; W
     }
 }
 
-/// Computes the displacement `d` of the template in the patch by linear least squares, `T = g (S + ∇S · d) + o(u)`, with an offset `o` that is linear over the patch (vignetting, and
-/// exposure differences); `None` for a low correlation, a large standard error, or clipped pixels.
-fn gauss_newton_step(template: ImageView<'_, u8, 1>, patch: &[f32; WIDE * WIDE]) -> Option<Vector2<f64>> {
-    let (mut normal, mut right) = (SMatrix::<f64, 6, 6>::zeros(), SVector::<f64, 6>::zeros());
-    let (mut sum, mut squares) = (0.0, 0.0);
-    for j in 0..SIDE {
-        for (i, t) in template.row(j).iter().enumerate() {
-            let k = (j + 1) * WIDE + i + 1;
-            let s = f64::from(patch[k]);
-            if s >= f64::from(CLIPPED) {
-                return None;
+/// The patch of the first photograph in the tones of the second, less its mean, and its sums.
+struct Template {
+    /// Rows of [`PADDED`] pixels.
+    values: [f32; SIDE * PADDED],
+    mean: f32,
+    /// Sum of the squares of the values.
+    squares: f64,
+    /// Sums of the values times their column and row, from the center.
+    moments: Vector2<f64>,
+}
+
+impl Template {
+    fn new(pixels: ImageView<'_, u8, 1>, tone: &[f32; 256]) -> Self {
+        let sum: f32 = (0..SIDE).flat_map(|j| pixels.row(j)).map(|v| tone[usize::from(*v)]).sum();
+        let mean = sum / (SIDE * SIDE) as f32;
+        let mut values = [0.0; SIDE * PADDED];
+        let (mut squares, mut moments) = (0.0, Vector2::zeros());
+        for (j, row) in values.chunks_exact_mut(PADDED).enumerate() {
+            for (i, (value, pixel)) in row.iter_mut().zip(pixels.row(j)).enumerate() {
+                *value = tone[usize::from(*pixel)] - mean;
+                let t = f64::from(*value);
+                squares += t * t;
+                moments += Vector2::new(offset(i), offset(j)) * t;
             }
-            let gx = 0.5 * f64::from(patch[k + 1] - patch[k - 1]);
-            let gy = 0.5 * f64::from(patch[k + WIDE] - patch[k - WIDE]);
-            let place = |k: usize| k as f64 - RADIUS as f64;
-            let (row, t) = (SVector::from([gx, gy, s, 1.0, place(i), place(j)]), f64::from(*t));
-            normal += row * row.transpose();
-            right += row * t;
-            sum += t;
-            squares += t * t;
         }
+        Self { values, mean, squares, moments }
     }
+}
+
+/// Offset of a row or column of a patch from its center.
+fn offset(k: usize) -> f64 {
+    k as f64 - RADIUS as f64
+}
+
+/// Sums over a patch of products of its gradients `gx` and `gy`, its values `s` and those `t` of the template, both less the template's mean; and row offsets `j`.
+#[derive(Clone, Copy)]
+enum Product {
+    GxGx,
+    GxGy,
+    GxS,
+    GyGy,
+    GyS,
+    SS,
+    TGx,
+    TGy,
+    TS,
+    Gx,
+    Gy,
+    S,
+    JGx,
+    JGy,
+    JS,
+    JGxS,
+    JGyS,
+    JSS,
+    JTS,
+    JJS,
+    JJSS,
+}
+
+/// Displacement, gain and its slopes, offset and its slopes.
+const UNKNOWNS: usize = 8;
+/// Number of [`Product`]s.
+const PRODUCTS: usize = Product::JJSS as usize + 1;
+
+/// Sums every product over the columns of a patch, one sum per row position; `None` where a pixel is clipped.
+#[inline(always)]
+fn column_sums(template: &Template, patch: &[f32; WIDE * STRIDE], sums: &mut [[f32; PADDED]; PRODUCTS]) -> bool {
+    let mut greatest = [f32::MIN; PADDED];
+    for left in (0..PADDED).step_by(LANES) {
+        let mut sum = [[0.0_f32; LANES]; PRODUCTS];
+        let mut most = [f32::MIN; LANES];
+        for j in 0..SIDE {
+            let take = |start: usize| -> [f32; LANES] { std::array::from_fn(|k| patch[start + k]) };
+            let start = (j + 1) * STRIDE + left + 1;
+            let (before, row, after) = (take(start - 1), take(start), take(start + 1));
+            let (above, below) = (take(start - STRIDE), take(start + STRIDE));
+            let t: [f32; LANES] = std::array::from_fn(|k| template.values[j * PADDED + left + k]);
+            let down = j as f32 - RADIUS as f32;
+            for k in 0..LANES {
+                let (gx, gy, s) = (0.5 * (after[k] - before[k]), 0.5 * (below[k] - above[k]), row[k] - template.mean);
+                let of = [
+                    gx * gx,
+                    gx * gy,
+                    gx * s,
+                    gy * gy,
+                    gy * s,
+                    s * s,
+                    t[k] * gx,
+                    t[k] * gy,
+                    t[k] * s,
+                    gx,
+                    gy,
+                    s,
+                    down * gx,
+                    down * gy,
+                    down * s,
+                    down * (gx * s),
+                    down * (gy * s),
+                    down * (s * s),
+                    down * (t[k] * s),
+                    down * (down * s),
+                    down * (down * (s * s)),
+                ];
+                for (sum, value) in sum.iter_mut().zip(of) {
+                    sum[k] += value;
+                }
+                most[k] = most[k].max(row[k]);
+            }
+        }
+        for (all, sum) in sums.iter_mut().zip(sum) {
+            all[left..left + LANES].copy_from_slice(&sum);
+        }
+        greatest[left..left + LANES].copy_from_slice(&most);
+    }
+    greatest[..SIDE].iter().all(|v| *v < f32::from(CLIPPED))
+}
+
+/// Computes the displacement `d` of the template in the patch by linear least squares, `T = g (S + ∇S · d) + o(u)`, with a gain `g` and an offset `o` that are linear over the patch
+/// (vignetting, and exposure differences), and its standard error, the root mean square of both axes; `None` for a low correlation, a large standard error, or clipped pixels.
+fn gauss_newton_step(
+    level: Level,
+    template: &Template,
+    patch: &[f32; WIDE * STRIDE],
+) -> Option<(Vector2<f64>, f64)> {
+    let mut columns = [[0.0; PADDED]; PRODUCTS];
+    if !dispatch!(level, _simd => column_sums(template, patch, &mut columns)) {
+        return None;
+    }
+    let sum = |p: Product| columns[p as usize][..SIDE].iter().map(|v| f64::from(*v)).sum::<f64>();
+    // The same with column offsets, and with their squares.
+    let across = |p: Product, power: i32| {
+        columns[p as usize][..SIDE].iter().enumerate().map(|(i, v)| offset(i).powi(power) * f64::from(*v)).sum::<f64>()
+    };
+    use Product::{
+        GxGx, GxGy, GxS, Gx, GyGy, GyS, Gy, JGx, JGxS, JGy, JGyS, JJS, JJSS, JS, JSS, JTS, S, SS, TGx, TGy, TS,
+    };
     let n = (SIDE * SIDE) as f64;
+    // Sum of the squares of the offsets along an axis.
+    let spread = SIDE as f64 * (0..SIDE).map(|k| offset(k).powi(2)).sum::<f64>();
+    // The lower triangle of the normal equations of the unknowns' coefficients: gradients, the values and their products with both offsets, 1, both offsets.
+    let rows: [&[f64]; UNKNOWNS] = [
+        &[sum(GxGx)],
+        &[sum(GxGy), sum(GyGy)],
+        &[sum(GxS), sum(GyS), sum(SS)],
+        &[across(GxS, 1), across(GyS, 1), across(SS, 1), across(SS, 2)],
+        &[sum(JGxS), sum(JGyS), sum(JSS), across(JSS, 1), sum(JJSS)],
+        &[sum(Gx), sum(Gy), sum(S), across(S, 1), sum(JS), n],
+        &[across(Gx, 1), across(Gy, 1), across(S, 1), across(S, 2), across(JS, 1), 0.0, spread],
+        &[sum(JGx), sum(JGy), sum(JS), across(JS, 1), sum(JJS), 0.0, 0.0, spread],
+    ];
+    let normal = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|r, c| rows[r.max(c)][r.min(c)]);
+    // The template has a mean of zero.
+    let (t_i, t_j) = (template.moments.x, template.moments.y);
+    let right = SVector::<f64, UNKNOWNS>::from([sum(TGx), sum(TGy), sum(TS), across(TS, 1), sum(JTS), 0.0, t_i, t_j]);
     let inverse = normal.cholesky()?.inverse();
     let solution = inverse * right;
     let gain = solution[2];
     // The residual of a linear fit: squares less what it explains.
-    let (residual, variance) = (squares - solution.dot(&right), squares - sum * sum / n);
-    if !(0.1..10.0).contains(&gain) || residual > (1.0 - MIN_CORRELATION * MIN_CORRELATION) * variance {
+    let residual = template.squares - solution.dot(&right);
+    if !(0.1..10.0).contains(&gain) || residual > (1.0 - MIN_CORRELATION * MIN_CORRELATION) * template.squares {
         return None;
     }
-    let standard_error = (residual.max(0.0) / (n - 6.0) * inverse[(0, 0)].max(inverse[(1, 1)])).sqrt() / gain;
-    if standard_error.is_nan() || standard_error >= MAX_STANDARD_ERROR_PX {
+    let variance = residual.max(0.0) / (n - UNKNOWNS as f64) / (gain * gain);
+    let [along, down] = [inverse[(0, 0)], inverse[(1, 1)]].map(|v| v * variance);
+    if !(along.max(down) < MAX_STANDARD_ERROR_PX * MAX_STANDARD_ERROR_PX) {
         return None;
     }
     let step = Vector2::new(solution[0], solution[1]) / gain;
     // The linearization holds for a pixel or so.
-    (step.norm() < MAX_CORRECTION_PX).then_some(step)
+    (step.norm() < MAX_CORRECTION_PX).then_some((step, (0.5 * (along + down)).sqrt()))
 }
 
 #[cfg(test)]
