@@ -47,8 +47,7 @@ impl Manifold for HomographyManifold {
 pub(crate) struct Overlap {
     pub(crate) i: usize,
     pub(crate) j: usize,
-    /// Points of both photographs, and the weight of their residuals: the inverse standard error relative to that of the best.
-    pub(crate) points: Vec<(Vector2<f64>, Vector2<f64>, f64)>,
+    pub(crate) points: Vec<(Vector2<f64>, Vector2<f64>)>,
 }
 
 /// Intrinsics shared by a group of photographs.
@@ -105,7 +104,7 @@ const INVALID_RESIDUAL_PX: f64 = 1e4;
 struct Transfers<const M: usize, const C: usize> {
     kind: Motion,
     generators: [Matrix3<f64>; M],
-    matches: Vec<(Vector2<f64>, Vector2<f64>, f64)>,
+    matches: Vec<(Vector2<f64>, Vector2<f64>)>,
 }
 
 impl<const M: usize, const C: usize> Residual<2, 4, C> for Transfers<M, C> {
@@ -118,7 +117,7 @@ impl<const M: usize, const C: usize> Residual<2, 4, C> for Transfers<M, C> {
         [source, target, from, to]: [&[f64]; 4],
         jacobian: Option<&mut SMatrix<f64, 2, C>>,
     ) -> Option<Vector2<f64>> {
-        let (a, b, weight) = self.matches[item];
+        let (a, b) = self.matches[item];
         let [from, to] = [from, to].map(|l| Lens { log_focal: l[0], k1: l[1] });
         let relative = Matrix3::from_column_slice(target) * inverse(self.kind, &Matrix3::from_column_slice(source));
         let invalid = Some(Vector2::new(INVALID_RESIDUAL_PX, 0.0));
@@ -126,7 +125,7 @@ impl<const M: usize, const C: usize> Residual<2, 4, C> for Transfers<M, C> {
         let x = p.to_homogeneous();
         let y = relative * x;
         let Some(projected) = project(&y, to) else { return invalid };
-        let Some(j) = jacobian else { return Some((projected - b) * weight) };
+        let Some(j) = jacobian else { return Some(projected - b) };
         let n = Point2::new(y.x / y.z, y.y / y.z);
         let f = to.log_focal.exp();
         let (_, by_n, by_lens) = to.distortion().distort_with_jacobians(n);
@@ -142,8 +141,7 @@ impl<const M: usize, const C: usize> Residual<2, 4, C> for Transfers<M, C> {
         j.set_column(2 * M + 1, &by_ray(-(inverse_lens * by_k1.column(0))));
         j.set_column(2 * M + 2, &projected);
         j.set_column(2 * M + 3, &(by_lens.column(0) * f));
-        *j *= weight;
-        Some((projected - b) * weight)
+        Some(projected - b)
     }
 }
 
@@ -247,8 +245,8 @@ impl Problem<'_> {
         let (mut matches, mut blocks) = (Vec::new(), Vec::new());
         for o in self.overlaps {
             let [i, j, from, to] = [o.i, o.j, self.lens_of[o.i], self.lens_of[o.j]].map(|n| n as u32);
-            for &(a, b, weight) in &o.points {
-                matches.extend([(a, b, weight), (b, a, weight)]);
+            for &(a, b) in &o.points {
+                matches.extend([(a, b), (b, a)]);
                 blocks.extend([[i, j, from, to], [j, i, to, from]]);
             }
         }
@@ -261,7 +259,7 @@ impl Problem<'_> {
         let one = |i, j, a, b: Vector2<f64>| {
             self.transfer(s, i, j, a).map_or(INVALID_RESIDUAL_PX * INVALID_RESIDUAL_PX, |p| (p - b).norm_squared())
         };
-        o.points.iter().map(|&(a, b, _)| 0.5 * (one(o.i, o.j, a, b) + one(o.j, o.i, b, a))).collect()
+        o.points.iter().map(|&(a, b)| 0.5 * (one(o.i, o.j, a, b) + one(o.j, o.i, b, a))).collect()
     }
 }
 
@@ -286,7 +284,7 @@ mod tests {
                     for v in -8..=8 {
                         let ray = Vector3::new(f64::from(u) * 0.06, f64::from(v) * 0.06, 1.0);
                         if let (Some(a), Some(b)) = (project(&rotations[i], ray), project(&rotations[j], ray)) {
-                            points.push((a, b, 1.0));
+                            points.push((a, b));
                         }
                     }
                 }

@@ -10,19 +10,12 @@ use cv_geometry::{PairEdge, PairGraph, VerifiedPair};
 use cv_numeric::{RobustLoss, svd3};
 use nalgebra::{Matrix3, Vector2};
 
-/// A pair, and a weight for each of its matches (see [`Overlap`]); none for equal weights.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct WeightedPair<'a> {
-    pub(crate) pair: &'a VerifiedPair,
-    pub(crate) weights: &'a [f64],
-}
-
 /// A connected component of the match graph; its photographs are indexed from 0.
 pub(crate) struct Group<'a> {
     /// Photograph of each member.
     members: Vec<usize>,
     photos: Vec<Photo>,
-    pub(crate) pairs: Vec<WeightedPair<'a>>,
+    pub(crate) pairs: Vec<&'a VerifiedPair>,
     /// Of `pairs`, in members' indices and centered pixels.
     overlaps: Vec<Overlap>,
     graph: PairGraph,
@@ -61,9 +54,9 @@ fn undistorted(p: &Photo, pixel: Point2<f64>) -> Vector2<f64> {
 }
 
 impl<'a> Group<'a> {
-    pub(crate) fn largest(photos: &[Photo], pairs: &[WeightedPair<'a>]) -> Result<Self, AlignError> {
+    pub(crate) fn largest(photos: &[Photo], pairs: &[&'a VerifiedPair]) -> Result<Self, AlignError> {
         let n = photos.len();
-        let edge = |WeightedPair { pair: p, .. }: &WeightedPair<'_>| PairEdge { a: p.a, b: p.b, weight: p.matches.len() as f64 };
+        let edge = |p: &&VerifiedPair| PairEdge { a: p.a, b: p.b, weight: p.matches.len() as f64 };
         let graph = |nodes: usize, edges: Vec<PairEdge>| {
             PairGraph::new(nodes, edges).map_err(|e| AlignError::BadPair { a: e.a, b: e.b, photos: n })
         };
@@ -74,22 +67,17 @@ impl<'a> Group<'a> {
         }
         let index = |photo: usize| members.binary_search(&photo).ok();
         let (mut kept, mut overlaps, mut edges) = (Vec::new(), Vec::new(), Vec::new());
-        for weighted in pairs {
-            let pair = weighted.pair;
+        for pair in pairs {
             let (Some(i), Some(j)) = (index(pair.a), index(pair.b)) else { continue };
             let points = pair
                 .matches
                 .iter()
-                .enumerate()
-                .map(|(k, c)| {
-                    let weight = weighted.weights.get(k).copied().unwrap_or(1.0);
-                    (undistorted(&photos[pair.a], c.a), undistorted(&photos[pair.b], c.b), weight)
-                })
-                .filter(|(a, b, _)| a.iter().chain(b.iter()).all(|v| v.is_finite()))
+                .map(|c| (undistorted(&photos[pair.a], c.a), undistorted(&photos[pair.b], c.b)))
+                .filter(|(a, b)| a.iter().chain(b.iter()).all(|v| v.is_finite()))
                 .collect();
-            kept.push(*weighted);
+            kept.push(*pair);
             overlaps.push(Overlap { i, j, points });
-            edges.push(PairEdge { a: i, b: j, ..edge(weighted) });
+            edges.push(PairEdge { a: i, b: j, ..edge(pair) });
         }
         let graph = graph(members.len(), edges)?;
         let tree = graph.maximum_spanning_forest();
@@ -115,7 +103,7 @@ impl<'a> Group<'a> {
 
     /// Returns the homography of an edge from member `from`, in pixels relative to the principal points.
     fn homography(&self, edge: usize, from: usize) -> Matrix3<f64> {
-        let (pair, e) = (self.pairs[edge].pair, self.graph.edges()[edge]);
+        let (pair, e) = (self.pairs[edge], self.graph.edges()[edge]);
         let shift = |v: Vector2<f64>| Matrix3::new(1.0, 0.0, v.x, 0.0, 1.0, v.y, 0.0, 0.0, 1.0);
         let h = shift(-center(&self.photos[e.b])) * pair.homography * shift(center(&self.photos[e.a]));
         if from == e.a { h } else { h.try_inverse().unwrap_or_else(Matrix3::identity) }
@@ -384,7 +372,7 @@ impl<'a> Group<'a> {
             .pairs
             .iter()
             .zip(&errors)
-            .map(|(WeightedPair { pair: p, .. }, e)| AlignedPair {
+            .map(|(p, e)| AlignedPair {
                 a: p.a,
                 b: p.b,
                 inliers: p.inliers.clone(),

@@ -14,7 +14,7 @@ pub use view::View;
 
 use cv_core::{Camera, Cancelled, Correspondence, Point2, Progress, Scaling, Stage, named};
 use cv_geometry::VerifiedPair;
-use group::{Group, WeightedPair};
+use group::Group;
 
 /// A photograph's size and what is known of its intrinsics beforehand.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -246,17 +246,6 @@ pub fn align(
     options: &AlignOptions,
     progress: &dyn Progress,
 ) -> Result<Alignment, AlignError> {
-    align_weighted(photos, pairs, &[], options, progress)
-}
-
-/// As [`align`], with a weight for each match of each pair; `weights` may be shorter than `pairs`, whose other matches have the weight 1.
-fn align_weighted(
-    photos: &[Photo],
-    pairs: &[VerifiedPair],
-    weights: &[Vec<f64>],
-    options: &AlignOptions,
-    progress: &dyn Progress,
-) -> Result<Alignment, AlignError> {
     let stage = Stage::new(progress, "align", 0)?;
     let n = photos.len();
     if n < 2 {
@@ -272,10 +261,8 @@ fn align_weighted(
         return Err(AlignError::BadPair { a: bad.a, b: bad.b, photos: n });
     }
     // Sorted: the result must not depend on the order of the input pairs.
-    let weights = |k: usize| weights.get(k).map_or(&[][..], Vec::as_slice);
-    let weighted = pairs.iter().enumerate().map(|(k, pair)| WeightedPair { pair, weights: weights(k) });
-    let mut pairs: Vec<WeightedPair<'_>> = weighted.filter(|p| !p.pair.matches.is_empty()).collect();
-    pairs.sort_by_key(|WeightedPair { pair, .. }| (pair.a.min(pair.b), pair.a.max(pair.b)));
+    let mut pairs: Vec<&VerifiedPair> = pairs.iter().filter(|p| !p.matches.is_empty()).collect();
+    pairs.sort_by_key(|p| (p.a.min(p.b), p.a.max(p.b)));
     let mut inconsistent = vec![false; n];
     loop {
         let group = Group::largest(photos, &pairs)?;
@@ -283,8 +270,8 @@ fn align_weighted(
         let bad = group.worst_inconsistency(&solution, motion, options);
         if let Some(bad) = bad {
             // One at a time: a false pair raises the residuals of the pairs around it.
-            let pair = group.pairs[bad].pair;
-            pairs.retain(|p| !std::ptr::eq(p.pair, pair));
+            let pair = group.pairs[bad];
+            pairs.retain(|p| !std::ptr::eq(*p, pair));
             for i in [pair.a, pair.b] {
                 inconsistent[i] = true;
             }

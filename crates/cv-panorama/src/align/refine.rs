@@ -3,7 +3,7 @@
 //! Feature positions have errors of some tenths of a pixel, from the scale space they are detected in. Around each inlier a patch of one photograph is registered to the
 //! other, with a gain and an offset for exposure differences, which is accurate to some hundredths; the bundle adjustment is then repeated.
 
-use crate::align::{AlignError, AlignOptions, Alignment, Photo, View, align_weighted};
+use crate::align::{AlignError, AlignOptions, Alignment, Photo, View, align};
 use cv_core::{Cancelled, Correspondence, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
 use cv_geometry::VerifiedPair;
 use cv_imgproc::bicubic_at;
@@ -28,6 +28,10 @@ const STRIDE: usize = PADDED + 2;
 const MAX_PATCHES: usize = 300;
 /// Scale of the loss relative to that of features, without parallax.
 const NARROW_LOSS_RATIO: f64 = 0.25;
+/// Scale of the loss relative to the median residual of the refined matches, without parallax: their errors are 0.06 px but for one in ten, which has up to a pixel.
+const LOSS_PER_MEDIAN: f64 = 2.5;
+/// Minimum scale of that loss in pixels.
+const MIN_LOSS_PX: f64 = 0.1;
 /// Median error of the features, relative to the scale of the loss, above which there is parallax: features alone are good to a quarter.
 const MAX_MEDIAN_RATIO: f64 = 0.4;
 /// Minimum number of refined matches of a pair; below, its features are kept.
@@ -42,8 +46,6 @@ const MAX_CORRECTION_PX: f64 = 2.0;
 const MIN_CORRELATION: f64 = 0.7;
 /// Maximum standard error of a registered position along either axis, in pixels, estimated from the residuals of the patch.
 const MAX_STANDARD_ERROR_PX: f64 = 0.1;
-/// Standard deviation, in pixels, of a registered position from interpolation and what the warp and the linear offset leave out: added to its standard error.
-const MODEL_SIGMA_PX: f64 = 0.03;
 /// Minimum smaller eigenvalue of the structure tensor of a patch: with noise of a gray level the standard error is the maximum.
 const MIN_CORNER_STRENGTH: f64 = 1.0;
 /// Level from which on a pixel is clipped.
@@ -69,7 +71,7 @@ pub fn refine_alignment(
     let count = (MAX_PATCHES * used / alignment.pairs.len().max(1)).min(MAX_PATCHES);
     let view = |i: usize| alignment.views.get(i).and_then(|v| v.as_ref().ok());
     let aligned: HashSet<(usize, usize)> = alignment.pairs.iter().map(|p| (p.a, p.b)).collect();
-    let refine = |pair: &VerifiedPair| -> Result<Option<(VerifiedPair, Vec<f64>)>, Cancelled> {
+    let refine = |pair: &VerifiedPair| -> Result<Option<VerifiedPair>, Cancelled> {
         stage.check()?;
         let is_used = aligned.contains(&(pair.a, pair.b));
         let (Some(from), Some(to), true) = (view(pair.a), view(pair.b), is_used) else { return Ok(None) };
@@ -77,27 +79,34 @@ pub fn refine_alignment(
         let candidates = candidates(pair, from, to, count);
         let tone = tone_map(first, second, from, to);
         let refined = candidates.iter().filter_map(|m| refine_match(level, (first, &tone), second, from, to, m));
-        let (matches, weights): (Vec<Correspondence>, Vec<f64>) = refined.unzip();
+        let matches: Vec<Correspondence> = refined.collect();
         if matches.len() < MIN_MATCHES {
-            return Ok(Some((pair.clone(), vec![weight_of(MAX_STANDARD_ERROR_PX); pair.matches.len()])));
+            return Ok(Some(pair.clone()));
         }
-        Ok(Some((VerifiedPair { inliers: (0..matches.len()).collect(), matches, ..pair.clone() }, weights)))
+        Ok(Some(VerifiedPair { inliers: (0..matches.len()).collect(), matches, ..pair.clone() }))
     };
-    let refined: Vec<Option<_>> = pairs.par_iter().map(refine).collect::<Result<_, _>>()?;
-    let (refined, weights): (Vec<VerifiedPair>, Vec<Vec<f64>>) = refined.into_iter().flatten().unzip();
+    let refined: Vec<Option<VerifiedPair>> = pairs.par_iter().map(refine).collect::<Result<_, _>>()?;
+    let refined: Vec<VerifiedPair> = refined.into_iter().flatten().collect();
     // Without parallax, residuals are those of the registration, and a narrow loss rejects what moved.
     let has_parallax = alignment.median_px > MAX_MEDIAN_RATIO * options.outlier_px;
     let outlier_px = options.outlier_px * if has_parallax { 1.0 } else { NARROW_LOSS_RATIO };
     let options = AlignOptions { motion: alignment.motion, outlier_px, ..*options };
-    // The focal lengths found are where the search for better ones starts.
-    let photos: Vec<Photo> = photos
-        .iter()
-        .enumerate()
-        .map(|(i, p)| Photo { focal: view(i).map(|v| v.camera.fx).or(p.focal), ..*p })
-        .collect();
-    // With parallax the matches differ by more than their standard errors.
-    let weights = if has_parallax { &[][..] } else { &weights };
-    let mut found = match align_weighted(&photos, &refined, weights, &options, progress) {
+    let solve = |start: &Alignment, options: &AlignOptions| {
+        // The focal lengths found are where the search for better ones starts.
+        let focal = |i: usize| start.views.get(i).and_then(|v| v.as_ref().ok()).map(|v| v.camera.fx);
+        let photos: Vec<Photo> =
+            photos.iter().enumerate().map(|(i, p)| Photo { focal: focal(i).or(p.focal), ..*p }).collect();
+        align(&photos, &refined, options, progress)
+    };
+    let found = match solve(&alignment, &options) {
+        // The median residual is known now: registrations beyond a few times as far off are false.
+        Ok(found) if !has_parallax => {
+            let scale = (LOSS_PER_MEDIAN * found.median_px).clamp(MIN_LOSS_PX, options.outlier_px);
+            solve(&found, &AlignOptions { outlier_px: scale, ..options })
+        }
+        other => other,
+    };
+    let mut found = match found {
         Ok(found) => found,
         Err(AlignError::Cancelled(stop)) => return Err(stop),
         Err(_) => return Ok(alignment),
@@ -110,11 +119,6 @@ pub fn refine_alignment(
     found.pairs = alignment.pairs;
     found.measure();
     Ok(found)
-}
-
-/// Returns the weight of the residuals of a match by its standard error, in pixels.
-fn weight_of(standard_error: f64) -> f64 {
-    MODEL_SIGMA_PX / standard_error.hypot(MODEL_SIGMA_PX)
 }
 
 /// Positions where patches are registered: `count` at most, half of them at features, the others on a grid over the overlap.
@@ -184,8 +188,7 @@ fn tone_map(first: &GrayU8, second: &GrayU8, from: &View, to: &View) -> [f32; 25
     map
 }
 
-/// Registers the patch around `m.a` to the second photograph, and returns the match and its weight; `None` where that fails: low texture, clipped pixels, low correlation,
-/// no convergence.
+/// Registers the patch around `m.a` to the second photograph; `None` where that fails: low texture, clipped pixels, low correlation, no convergence.
 fn refine_match(
     level: Level,
     (first, tone): (&GrayU8, &[f32; 256]),
@@ -193,7 +196,7 @@ fn refine_match(
     from: &View,
     to: &View,
     m: &Correspondence,
-) -> Option<(Correspondence, f64)> {
+) -> Option<Correspondence> {
     // At a pixel center, so that the template needs no interpolation.
     let (x, y) = (m.a.x.round(), m.a.y.round());
     let inside = |v: f64, n: usize| v >= RADIUS as f64 && v + RADIUS as f64 <= n as f64 - 1.0;
@@ -216,13 +219,13 @@ fn refine_match(
         if !sample(level, second, b, &warp, &mut patch) {
             return None;
         }
-        let (step, standard_error) = gauss_newton_step(level, &template, &patch)?;
+        let step = gauss_newton_step(level, &template, &patch)?;
         b += warp.x * step.x + warp.y * step.y;
         if (b - start).norm() > MAX_CORRECTION_PX {
             return None;
         }
         if step.norm() < TOLERANCE_PX {
-            return Some((Correspondence { a, b }, weight_of(standard_error)));
+            return Some(Correspondence { a, b });
         }
     }
     None
@@ -430,12 +433,8 @@ fn column_sums(template: &Template, patch: &[f32; WIDE * STRIDE], sums: &mut [[f
 }
 
 /// Computes the displacement `d` of the template in the patch by linear least squares, `T = g (S + ∇S · d) + o(u)`, with a gain `g` and an offset `o` that are linear over the patch
-/// (vignetting, and exposure differences), and its standard error, the root mean square of both axes; `None` for a low correlation, a large standard error, or clipped pixels.
-fn gauss_newton_step(
-    level: Level,
-    template: &Template,
-    patch: &[f32; WIDE * STRIDE],
-) -> Option<(Vector2<f64>, f64)> {
+/// (vignetting, and exposure differences); `None` for a low correlation, a large standard error, or clipped pixels.
+fn gauss_newton_step(level: Level, template: &Template, patch: &[f32; WIDE * STRIDE]) -> Option<Vector2<f64>> {
     let mut columns = [[0.0; PADDED]; PRODUCTS];
     if !dispatch!(level, _simd => column_sums(template, patch, &mut columns)) {
         return None;
@@ -481,7 +480,7 @@ fn gauss_newton_step(
     }
     let step = Vector2::new(solution[0], solution[1]) / gain;
     // The linearization holds for a pixel or so.
-    (step.norm() < MAX_CORRECTION_PX).then_some((step, (0.5 * (along + down)).sqrt()))
+    (step.norm() < MAX_CORRECTION_PX).then_some(step)
 }
 
 #[cfg(test)]
