@@ -77,8 +77,7 @@ pub fn refine_alignment(
         let (Some(from), Some(to), true) = (view(pair.a), view(pair.b), is_used) else { return Ok(None) };
         let (Some(first), Some(second)) = (images.get(pair.a), images.get(pair.b)) else { return Ok(None) };
         let candidates = candidates(pair, from, to, count);
-        let tone = tone_map(first, second, from, to);
-        let refined = candidates.iter().filter_map(|m| refine_match(level, (first, &tone), second, from, to, m));
+        let refined = candidates.iter().filter_map(|m| refine_match(level, [first, second], from, to, m));
         let matches: Vec<Correspondence> = refined.collect();
         if matches.len() < MIN_MATCHES {
             return Ok(Some(pair.clone()));
@@ -149,50 +148,10 @@ fn keep_reasons(
     views.into_iter().zip(&alignment.views).map(|(new, old)| old.and(new)).collect()
 }
 
-/// Spacing, in pixels, of the samples of a tone map.
-const TONE_SPACING: usize = 4;
-/// Minimum number of samples of a tone map.
-const MIN_TONE_SAMPLES: u32 = 1000;
-
-/// Maps gray levels of the first photograph to those of the second by matching their histograms over the overlap; the identity where that is small. A camera's response makes another
-/// exposure more than a gain, which would move edges to one side.
-fn tone_map(first: &GrayU8, second: &GrayU8, from: &View, to: &View) -> [f32; 256] {
-    let (mut of_first, mut of_second) = ([0_u32; 256], [0_u32; 256]);
-    for y in (0..first.height()).step_by(TONE_SPACING) {
-        for x in (0..first.width()).step_by(TONE_SPACING) {
-            let seen = from.ray(Point2::new(x as f64, y as f64)).and_then(|ray| to.project(&ray));
-            if let Some(p) = seen.filter(|p| to.contains(*p))
-                && let Some([level]) = second.get(p.x.round().max(0.0) as usize, p.y.round().max(0.0) as usize)
-            {
-                of_first[usize::from(first.at(x, y)[0])] += 1;
-                of_second[usize::from(level)] += 1;
-            }
-        }
-    }
-    let mut map = std::array::from_fn(|v| v as f32);
-    if of_first.iter().sum::<u32>() < MIN_TONE_SAMPLES {
-        return map;
-    }
-    let (mut below, mut level, mut below_level) = (0.0_f32, 0, 0.0_f32);
-    for (count, to) in of_first.iter().zip(&mut map) {
-        // The middle of a level's samples.
-        let rank = below + 0.5 * *count as f32;
-        below += *count as f32;
-        while level < 255 && below_level + (of_second[level] as f32) < rank {
-            below_level += of_second[level] as f32;
-            level += 1;
-        }
-        // Samples are spread evenly over their level.
-        *to = level as f32 - 0.5 + ((rank - below_level) / (of_second[level].max(1)) as f32).clamp(0.0, 1.0);
-    }
-    map
-}
-
 /// Registers the patch around `m.a` to the second photograph; `None` where that fails: low texture, clipped pixels, low correlation, no convergence.
 fn refine_match(
     level: Level,
-    (first, tone): (&GrayU8, &[f32; 256]),
-    second: &GrayU8,
+    [first, second]: [&GrayU8; 2],
     from: &View,
     to: &View,
     m: &Correspondence,
@@ -211,7 +170,7 @@ fn refine_match(
     if (0..SIDE).any(|row| pixels.row(row).iter().any(|v| *v >= CLIPPED)) || !has_texture(pixels) {
         return None;
     }
-    let template = Template::new(pixels, tone);
+    let template = Template::new(pixels);
     let start = m.b + (center - transfer(m.a)?);
     let mut b = start;
     let mut patch = [0.0_f32; WIDE * STRIDE];
@@ -314,7 +273,7 @@ fn sample_rows(image: &GrayU8, b: Vector2<f32>, warp: &Warp, patch: &mut [f32; W
     }
 }
 
-/// The patch of the first photograph in the tones of the second, less its mean, and its sums.
+/// The patch of the first photograph, less its mean, and its sums.
 struct Template {
     /// Rows of [`PADDED`] pixels.
     values: [f32; SIDE * PADDED],
@@ -326,14 +285,14 @@ struct Template {
 }
 
 impl Template {
-    fn new(pixels: ImageView<'_, u8, 1>, tone: &[f32; 256]) -> Self {
-        let sum: f32 = (0..SIDE).flat_map(|j| pixels.row(j)).map(|v| tone[usize::from(*v)]).sum();
-        let mean = sum / (SIDE * SIDE) as f32;
+    fn new(pixels: ImageView<'_, u8, 1>) -> Self {
+        let sum: u32 = (0..SIDE).flat_map(|j| pixels.row(j)).map(|v| u32::from(*v)).sum();
+        let mean = sum as f32 / (SIDE * SIDE) as f32;
         let mut values = [0.0; SIDE * PADDED];
         let (mut squares, mut moments) = (0.0, Vector2::zeros());
         for (j, row) in values.chunks_exact_mut(PADDED).enumerate() {
             for (i, (value, pixel)) in row.iter_mut().zip(pixels.row(j)).enumerate() {
-                *value = tone[usize::from(*pixel)] - mean;
+                *value = f32::from(*pixel) - mean;
                 let t = f64::from(*value);
                 squares += t * t;
                 moments += Vector2::new(offset(i), offset(j)) * t;
@@ -366,18 +325,12 @@ enum Product {
     JGx,
     JGy,
     JS,
-    JGxS,
-    JGyS,
-    JSS,
-    JTS,
-    JJS,
-    JJSS,
 }
 
-/// Displacement, gain and its slopes, offset and its slopes.
-const UNKNOWNS: usize = 8;
+/// Displacement, gain, offset and its slopes.
+const UNKNOWNS: usize = 6;
 /// Number of [`Product`]s.
-const PRODUCTS: usize = Product::JJSS as usize + 1;
+const PRODUCTS: usize = Product::JS as usize + 1;
 
 /// Sums every product over the columns of a patch, one sum per row position; `None` where a pixel is clipped.
 #[inline(always)]
@@ -411,12 +364,6 @@ fn column_sums(template: &Template, patch: &[f32; WIDE * STRIDE], sums: &mut [[f
                     down * gx,
                     down * gy,
                     down * s,
-                    down * (gx * s),
-                    down * (gy * s),
-                    down * (s * s),
-                    down * (t[k] * s),
-                    down * (down * s),
-                    down * (down * (s * s)),
                 ];
                 for (sum, value) in sum.iter_mut().zip(of) {
                     sum[k] += value;
@@ -432,39 +379,35 @@ fn column_sums(template: &Template, patch: &[f32; WIDE * STRIDE], sums: &mut [[f
     greatest[..SIDE].iter().all(|v| *v < f32::from(CLIPPED))
 }
 
-/// Computes the displacement `d` of the template in the patch by linear least squares, `T = g (S + ∇S · d) + o(u)`, with a gain `g` and an offset `o` that are linear over the patch
-/// (vignetting, and exposure differences); `None` for a low correlation, a large standard error, or clipped pixels.
+/// Computes the displacement `d` of the template in the patch by linear least squares, `T = g (S + ∇S · d) + o(u)`, with an offset `o` that is linear over the patch (vignetting, and
+/// exposure differences); `None` for a low correlation, a large standard error, or clipped pixels.
 fn gauss_newton_step(level: Level, template: &Template, patch: &[f32; WIDE * STRIDE]) -> Option<Vector2<f64>> {
     let mut columns = [[0.0; PADDED]; PRODUCTS];
     if !dispatch!(level, _simd => column_sums(template, patch, &mut columns)) {
         return None;
     }
     let sum = |p: Product| columns[p as usize][..SIDE].iter().map(|v| f64::from(*v)).sum::<f64>();
-    // The same with column offsets, and with their squares.
-    let across = |p: Product, power: i32| {
-        columns[p as usize][..SIDE].iter().enumerate().map(|(i, v)| offset(i).powi(power) * f64::from(*v)).sum::<f64>()
+    // The same with column offsets.
+    let across = |p: Product| {
+        columns[p as usize][..SIDE].iter().enumerate().map(|(i, v)| offset(i) * f64::from(*v)).sum::<f64>()
     };
-    use Product::{
-        GxGx, GxGy, GxS, Gx, GyGy, GyS, Gy, JGx, JGxS, JGy, JGyS, JJS, JJSS, JS, JSS, JTS, S, SS, TGx, TGy, TS,
-    };
+    use Product::{Gx, GxGx, GxGy, GxS, Gy, GyGy, GyS, JGx, JGy, JS, S, SS, TGx, TGy, TS};
     let n = (SIDE * SIDE) as f64;
     // Sum of the squares of the offsets along an axis.
     let spread = SIDE as f64 * (0..SIDE).map(|k| offset(k).powi(2)).sum::<f64>();
-    // The lower triangle of the normal equations of the unknowns' coefficients: gradients, the values and their products with both offsets, 1, both offsets.
+    // The lower triangle of the normal equations: gradients, values, 1, offsets of columns and rows.
     let rows: [&[f64]; UNKNOWNS] = [
         &[sum(GxGx)],
         &[sum(GxGy), sum(GyGy)],
         &[sum(GxS), sum(GyS), sum(SS)],
-        &[across(GxS, 1), across(GyS, 1), across(SS, 1), across(SS, 2)],
-        &[sum(JGxS), sum(JGyS), sum(JSS), across(JSS, 1), sum(JJSS)],
-        &[sum(Gx), sum(Gy), sum(S), across(S, 1), sum(JS), n],
-        &[across(Gx, 1), across(Gy, 1), across(S, 1), across(S, 2), across(JS, 1), 0.0, spread],
-        &[sum(JGx), sum(JGy), sum(JS), across(JS, 1), sum(JJS), 0.0, 0.0, spread],
+        &[sum(Gx), sum(Gy), sum(S), n],
+        &[across(Gx), across(Gy), across(S), 0.0, spread],
+        &[sum(JGx), sum(JGy), sum(JS), 0.0, 0.0, spread],
     ];
     let normal = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|r, c| rows[r.max(c)][r.min(c)]);
     // The template has a mean of zero.
     let (t_i, t_j) = (template.moments.x, template.moments.y);
-    let right = SVector::<f64, UNKNOWNS>::from([sum(TGx), sum(TGy), sum(TS), across(TS, 1), sum(JTS), 0.0, t_i, t_j]);
+    let right = SVector::<f64, UNKNOWNS>::from([sum(TGx), sum(TGy), sum(TS), 0.0, t_i, t_j]);
     let inverse = normal.cholesky()?.inverse();
     let solution = inverse * right;
     let gain = solution[2];
@@ -536,7 +479,7 @@ mod tests {
             let (from, to) = (&views[i], &views[j]);
             let mut off = Vec::new();
             for m in matches(from, to, 0.7) {
-                if let Some(found) = refine_match(&images[i], &images[j], from, to, &m) {
+                if let Some(found) = refine_match(Level::new(), [&images[i], &images[j]], from, to, &m) {
                     assert_eq!((found.a - m.a).map(|v| v.abs() <= 0.5), Vector2::new(true, true));
                     off.push((found.b - to.project(&from.ray(found.a).unwrap()).unwrap()).norm());
                 }
@@ -555,7 +498,7 @@ mod tests {
         let views = views();
         let images = images(&views);
         let m = matches(&views[0], &views[1], 0.0)[120];
-        let refine = |second: &GrayU8| refine_match(&images[0], second, &views[0], &views[1], &m);
+        let refine = |second: &GrayU8| refine_match(Level::new(), [&images[0], second], &views[0], &views[1], &m);
         assert!(refine(&images[1]).is_some());
         assert_eq!(refine(&GrayU8::new(320, 240, [90])), None);
         assert_eq!(refine(&GrayU8::new(320, 240, [255])), None);
@@ -563,7 +506,7 @@ mod tests {
         assert_eq!(refine(&foreign), None);
         // Off by more than a correction may be.
         let far = Correspondence { b: m.b + Vector2::new(6.0, 0.0), ..m };
-        assert_eq!(refine_match(&images[0], &images[1], &views[0], &views[1], &far), None);
+        assert_eq!(refine_match(Level::new(), [&images[0], &images[1]], &views[0], &views[1], &far), None);
     }
 
     #[test]

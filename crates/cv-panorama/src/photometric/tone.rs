@@ -143,21 +143,25 @@ impl<'a> ExposureCorrection<'a> {
     pub(crate) fn row_of_levels<const FINE: bool>(&self, colors: [&mut [f32]; 3], lifts: &[f32], clipped: &mut [f32]) {
         /// Smallest channel at which a color begins to count as clipped, and at which it counts fully.
         const CLIPPED: [f32; 2] = [228.0, 252.0];
+        /// Distance of the smallest channel from the former level at which a channel's own clipping counts fully: what is nearly white hardly exceeds it.
+        const COLORED: f32 = 24.0;
         /// Level at which a channel begins to count as clipped by itself, and at which it counts fully.
         const CHANNEL_CLIPPED: [f32; 2] = [236.0, 252.0];
         let n = lifts.len();
         let ([r, g, b], clipped) = (colors.map(|c| &mut c[..n]), &mut clipped[..n]);
         for (((clipped, r), g), b) in clipped.iter_mut().zip(&*r).zip(&*g).zip(&*b) {
-            let share = ((r.min(*g).min(*b) - CLIPPED[0]) * (1.0 / (CLIPPED[1] - CLIPPED[0]))).clamp(0.0, 1.0);
-            *clipped = share * share * (3.0 - 2.0 * share);
+            let beyond = r.min(*g).min(*b) - CLIPPED[0];
+            let share = (beyond * (1.0 / (CLIPPED[1] - CLIPPED[0]))).clamp(0.0, 1.0);
+            // Negative for colors: how far they are from white.
+            *clipped = share * share * (3.0 - 2.0 * share) + (beyond * (1.0 / COLORED)).clamp(-1.0, 0.0);
         }
         // One channel at a time, so that lookups of different pixels overlap.
         for ((values, gain), clipped_lift) in [r, g, b].into_iter().zip(self.gain).zip(self.clipped_lift) {
             for ((value, lift), clipped) in values.iter_mut().zip(lifts).zip(&*clipped) {
                 let beyond = (*value - CHANNEL_CLIPPED[0]) * (1.0 / (CHANNEL_CLIPPED[1] - CHANNEL_CLIPPED[0]));
-                let stops = gain + lift + clipped_lift * beyond.clamp(0.0, 1.0);
+                let stops = gain + lift - clipped_lift * beyond.clamp(0.0, 1.0) * clipped.min(0.0);
                 let tone = self.tone.level(self.tone.index::<FINE>(*value) + stops * ENTRIES_PER_STOP);
-                *value = tone + clipped * (255.0 - tone);
+                *value = tone + clipped.max(0.0) * (255.0 - tone);
             }
         }
     }
