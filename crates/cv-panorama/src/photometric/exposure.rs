@@ -30,8 +30,8 @@ pub struct Gains {
     /// `v₁` and `v₂`: radiance at distance r from the image center (1 at the corners) is multiplied by `exp(v₁ r² + v₂ r⁴)`.
     pub vignetting: [f32; 2],
     /// Stops by which red, green and blue of each photograph exceed the level at which they clip, where another photograph shows them and another channel is not clipped: their median,
-    /// for the panorama's estimate of clipped channels. NaN where too little shows it.
-    pub clipped_stops: Vec<[f32; 3]>,
+    /// for the panorama's estimate of clipped channels. `None` where too little shows it.
+    pub clipped_stops: Vec<[Option<f32>; 3]>,
     /// `p₀`, `p₁`, `p₂`: the radiance of a level `v`, 0 to 1, is that of sRGB times `2^((1 − v)(p₀ + p₁ v + p₂ v²))`.
     pub response: [f64; 3],
 }
@@ -41,7 +41,7 @@ impl Gains {
         Self {
             gains: vec![[1.0; 3]; photos],
             vignetting: [0.0; 2],
-            clipped_stops: vec![[0.0; 3]; photos],
+            clipped_stops: vec![[None; 3]; photos],
             response: [0.0; 3],
         }
     }
@@ -189,7 +189,7 @@ const MIN_CLIPPED_SAMPLES: usize = 20;
 const MAX_BOUND_VIOLATION: f64 = 0.3;
 
 /// Estimates [`Gains::clipped_stops`].
-fn clipped_stops(samples: &[Sample], unknowns: Unknowns, solution: &DVector<f64>) -> Vec<[f32; 3]> {
+fn clipped_stops(samples: &[Sample], unknowns: Unknowns, solution: &DVector<f64>) -> Vec<[Option<f32>; 3]> {
     let mut excess: Vec<[Vec<f64>; 3]> = (0..unknowns.photos).map(|_| Default::default()).collect();
     for s in samples {
         // Of a color that is clipped in all channels nothing remains.
@@ -210,12 +210,14 @@ fn clipped_stops(samples: &[Sample], unknowns: Unknowns, solution: &DVector<f64>
         }
     }
     let median = |values: &mut Vec<f64>| match values.len() {
-        MIN_CLIPPED_SAMPLES.. => cv_core::median(values).map_or(f32::NAN, |v| v as f32),
-        _ => f32::NAN,
+        MIN_CLIPPED_SAMPLES.. => cv_core::median(values).map(|v| v as f32),
+        _ => None,
     };
     excess.iter_mut().map(|channels| channels.each_mut().map(median)).collect()
 }
 
+/// Range of exposures, in stops, from which on the mean level is bounded: equal exposures keep their levels.
+const MIN_EXPOSURE_SPREAD: f32 = 0.1;
 /// Maximum number of preview pixels sampled for the mean level.
 const MAX_MEAN_SAMPLES: usize = 10_000;
 
@@ -243,14 +245,20 @@ fn anchor(gains: &mut Gains, preview: &Preview, photo_of: &[usize]) {
         }
     }
     let before: f64 = nearest.iter().map(|(_, mean)| mean).sum();
-    let means = || preview.photo_means.iter().copied().filter(|mean| *mean > 0.0);
-    let before = if means().next().is_some() {
-        let sum_of_levels = 3.0 * nearest.len() as f64;
-        let (darkest, brightest) = (means().fold(f64::INFINITY, f64::min), means().fold(0.0, f64::max));
-        before.clamp(darkest * sum_of_levels, brightest * sum_of_levels)
-    } else {
-        before
-    };
+    // Equal exposures keep their levels: means by what the canvas shows of the photographs. Others are bounded by the photographs themselves.
+    let stops = || gains.gains.iter().map(|g| g[1].log2());
+    let spread = stops().fold(f32::MIN, f32::max) - stops().fold(f32::MAX, f32::min);
+    let mut on_canvas = vec![(0.0, 0.0); gains.gains.len()];
+    for (color, _, photo, _) in &colors {
+        on_canvas[*photo].0 += f64::from(color.iter().sum::<f32>()) / 3.0;
+        on_canvas[*photo].1 += 1.0;
+    }
+    let own = |photo: usize| preview.photo_means.get(photo).copied().filter(|_| spread > MIN_EXPOSURE_SPREAD);
+    let seen = on_canvas.iter().enumerate().filter(|(_, (_, count))| *count > 0.0);
+    let means: Vec<f64> = seen.map(|(photo, (sum, count))| own(photo).unwrap_or(sum / count)).collect();
+    let (darkest, brightest) = means.iter().fold((f64::INFINITY, 0.0_f64), |m, v| (m.0.min(*v), m.1.max(*v)));
+    let sum_of_levels = 3.0 * nearest.len() as f64;
+    let before = before.min(brightest * sum_of_levels).max(darkest.min(brightest) * sum_of_levels);
     let shifted = |stops: f64| {
         let factor = stops.exp2() as f32;
         Gains { gains: gains.gains.iter().map(|g| g.map(|g| g * factor)).collect(), ..gains.clone() }
@@ -389,7 +397,7 @@ mod tests {
 
     /// Three photographs of 60 x 40, 30 apart, of one scene, their light multiplied by known factors and less toward their corners.
     fn preview(factors: &[[f64; 3]; 3], fall_off: f64, contrast: f64, moved: bool) -> Preview {
-        let pieces = (0..3)
+        let pieces: Vec<Piece> = (0..3)
             .map(|k| {
                 let bounds = Bounds { left: 30 * k, top: 0, right: 30 * k + 60, bottom: 40 };
                 let radius: Vec<f32> = (0..60 * 40)

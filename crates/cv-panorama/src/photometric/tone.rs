@@ -116,8 +116,8 @@ impl<'a> ExposureCorrection<'a> {
         let gain = gains.gains.get(photo).map_or([0.0; 3], |g| g.map(f32::log2));
         let clipped = gains.clipped();
         // Without an observation: half of what the photograph is darkened by.
-        let known = gains.clipped_stops.get(photo).copied().unwrap_or([f32::NAN; 3]);
-        let lift = |c: usize| if known[c].is_nan() { -0.5 * gain[c] } else { known[c].min(-gain[c]) };
+        let known = gains.clipped_stops.get(photo).copied().unwrap_or_default();
+        let lift = |c: usize| known[c].map_or(-0.5 * gain[c], |stops| stops.min(-gain[c]));
         let clipped_lift = std::array::from_fn(|c| lift(c).max(0.0));
         Self { tone, gain, clipped, clipped_lift, vignetting: gains.vignetting.map(|v| v * std::f32::consts::LOG2_E) }
     }
