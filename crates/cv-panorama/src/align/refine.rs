@@ -10,6 +10,7 @@ use cv_imgproc::bicubic_at;
 use fearless_simd::{Level, dispatch};
 use nalgebra::{SMatrix, SVector};
 use rayon::prelude::*;
+use std::collections::HashSet;
 
 /// Patch radius in pixels.
 const RADIUS: usize = 9;
@@ -17,10 +18,20 @@ const RADIUS: usize = 9;
 const SIDE: usize = 2 * RADIUS + 1;
 /// Side of a patch with a margin of one pixel for gradients.
 const WIDE: usize = SIDE + 2;
+/// Pixels of a row whose products are summed at once.
+const LANES: usize = 8;
+/// Pixels of a row of a patch in whole vectors; those beyond [`SIDE`] are ignored.
+const PADDED: usize = SIDE.next_multiple_of(LANES);
+/// Row stride of a warped patch: whole vectors and the margin.
+const STRIDE: usize = PADDED + 2;
 /// Maximum number of patches per pair, and per photograph if it has several pairs.
 const MAX_PATCHES: usize = 300;
 /// Scale of the loss relative to that of features, without parallax.
 const NARROW_LOSS_RATIO: f64 = 0.25;
+/// Scale of the loss relative to the median residual of the refined matches, without parallax: their errors are 0.06 px but for one in ten, which has up to a pixel.
+const LOSS_PER_MEDIAN: f64 = 2.5;
+/// Minimum scale of that loss in pixels.
+const MIN_LOSS_PX: f64 = 0.1;
 /// Median error of the features, relative to the scale of the loss, above which there is parallax: features alone are good to a quarter.
 const MAX_MEDIAN_RATIO: f64 = 0.4;
 /// Minimum number of refined matches of a pair; below, its features are kept.
@@ -55,16 +66,18 @@ pub fn refine_alignment(
     progress: &dyn Progress,
 ) -> Result<Alignment, Cancelled> {
     let stage = Stage::new(progress, "align", 0)?;
+    let level = Level::new();
     let used = alignment.used().count();
     let count = (MAX_PATCHES * used / alignment.pairs.len().max(1)).min(MAX_PATCHES);
+    let view = |i: usize| alignment.views.get(i).and_then(|v| v.as_ref().ok());
+    let aligned: HashSet<(usize, usize)> = alignment.pairs.iter().map(|p| (p.a, p.b)).collect();
     let refine = |pair: &VerifiedPair| -> Result<Option<VerifiedPair>, Cancelled> {
         stage.check()?;
-        let view = |i: usize| alignment.views.get(i).and_then(|v| v.as_ref().ok());
-        let is_used = alignment.pairs.iter().any(|p| (p.a, p.b) == (pair.a, pair.b));
+        let is_used = aligned.contains(&(pair.a, pair.b));
         let (Some(from), Some(to), true) = (view(pair.a), view(pair.b), is_used) else { return Ok(None) };
         let (Some(first), Some(second)) = (images.get(pair.a), images.get(pair.b)) else { return Ok(None) };
         let candidates = candidates(pair, from, to, count);
-        let refined = candidates.iter().filter_map(|m| refine_match(first, second, from, to, m));
+        let refined = candidates.iter().filter_map(|m| refine_match(level, [first, second], from, to, m));
         let matches: Vec<Correspondence> = refined.collect();
         if matches.len() < MIN_MATCHES {
             return Ok(Some(pair.clone()));
@@ -77,11 +90,22 @@ pub fn refine_alignment(
     let has_parallax = alignment.median_px > MAX_MEDIAN_RATIO * options.outlier_px;
     let outlier_px = options.outlier_px * if has_parallax { 1.0 } else { NARROW_LOSS_RATIO };
     let options = AlignOptions { motion: alignment.motion, outlier_px, ..*options };
-    // The focal lengths found are where the search for better ones starts.
-    let focal = |i: usize| alignment.views.get(i).and_then(|v| v.as_ref().ok()).map(|v| v.camera.fx);
-    let photos: Vec<Photo> =
-        photos.iter().enumerate().map(|(i, p)| Photo { focal: focal(i).or(p.focal), ..*p }).collect();
-    let mut found = match align(&photos, &refined, &options, progress) {
+    let solve = |start: &Alignment, options: &AlignOptions| {
+        // The focal lengths found are where the search for better ones starts.
+        let focal = |i: usize| start.views.get(i).and_then(|v| v.as_ref().ok()).map(|v| v.camera.fx);
+        let photos: Vec<Photo> =
+            photos.iter().enumerate().map(|(i, p)| Photo { focal: focal(i).or(p.focal), ..*p }).collect();
+        align(&photos, &refined, options, progress)
+    };
+    let found = match solve(&alignment, &options) {
+        // The median residual is known now: registrations beyond a few times as far off are false.
+        Ok(found) if !has_parallax => {
+            let scale = (LOSS_PER_MEDIAN * found.median_px).clamp(MIN_LOSS_PX, options.outlier_px);
+            solve(&found, &AlignOptions { outlier_px: scale, ..options })
+        }
+        other => other,
+    };
+    let mut found = match found {
         Ok(found) => found,
         Err(AlignError::Cancelled(stop)) => return Err(stop),
         Err(_) => return Ok(alignment),
@@ -125,7 +149,13 @@ fn keep_reasons(
 }
 
 /// Registers the patch around `m.a` to the second photograph; `None` where that fails: low texture, clipped pixels, low correlation, no convergence.
-fn refine_match(first: &GrayU8, second: &GrayU8, from: &View, to: &View, m: &Correspondence) -> Option<Correspondence> {
+fn refine_match(
+    level: Level,
+    [first, second]: [&GrayU8; 2],
+    from: &View,
+    to: &View,
+    m: &Correspondence,
+) -> Option<Correspondence> {
     // At a pixel center, so that the template needs no interpolation.
     let (x, y) = (m.a.x.round(), m.a.y.round());
     let inside = |v: f64, n: usize| v >= RADIUS as f64 && v + RADIUS as f64 <= n as f64 - 1.0;
@@ -136,18 +166,19 @@ fn refine_match(first: &GrayU8, second: &GrayU8, from: &View, to: &View, m: &Cor
     let transfer = |p: Point2<f64>| to.project(&from.ray(p)?);
     let center = transfer(a)?;
     let warp = Warp::new(|i, j| transfer(a + Vector2::new(i, j)), center)?;
-    let template = first.view().crop(x as usize - RADIUS, y as usize - RADIUS, SIDE, SIDE)?;
-    if (0..SIDE).any(|row| template.row(row).iter().any(|v| *v >= CLIPPED)) || !has_texture(template) {
+    let pixels = first.view().crop(x as usize - RADIUS, y as usize - RADIUS, SIDE, SIDE)?;
+    if (0..SIDE).any(|row| pixels.row(row).iter().any(|v| *v >= CLIPPED)) || !has_texture(pixels) {
         return None;
     }
+    let template = Template::new(pixels);
     let start = m.b + (center - transfer(m.a)?);
     let mut b = start;
-    let mut patch = [0.0_f32; WIDE * WIDE];
+    let mut patch = [0.0_f32; WIDE * STRIDE];
     for _ in 0..MAX_ITERATIONS {
-        if !sample(second, b, &warp, &mut patch) {
+        if !sample(level, second, b, &warp, &mut patch) {
             return None;
         }
-        let step = gauss_newton_step(template, &patch)?;
+        let step = gauss_newton_step(level, &template, &patch)?;
         b += warp.x * step.x + warp.y * step.y;
         if (b - start).norm() > MAX_CORRECTION_PX {
             return None;
@@ -212,7 +243,7 @@ impl Warp {
 }
 
 /// Samples the warped patch around `b` with a margin of one pixel; false where it leaves the image.
-fn sample(image: &GrayU8, b: Point2<f64>, warp: &Warp, patch: &mut [f32; WIDE * WIDE]) -> bool {
+fn sample(level: Level, image: &GrayU8, b: Point2<f64>, warp: &Warp, patch: &mut [f32; WIDE * STRIDE]) -> bool {
     let h = (WIDE / 2) as f64;
     let (right, bottom) = (image.width() as f64 - 2.0, image.height() as f64 - 2.0);
     let is_inside = |p: Point2<f64>| p.x.is_finite() && p.x >= 1.0 && p.y >= 1.0 && p.x <= right && p.y <= bottom;
@@ -220,18 +251,18 @@ fn sample(image: &GrayU8, b: Point2<f64>, warp: &Warp, patch: &mut [f32; WIDE * 
         return false;
     }
     let b = b.coords.cast::<f32>();
-    dispatch!(Level::new(), _simd => sample_rows(image, b, warp, patch));
+    dispatch!(level, _simd => sample_rows(image, b, warp, patch));
     true
 }
 
 #[inline(always)]
-fn sample_rows(image: &GrayU8, b: Vector2<f32>, warp: &Warp, patch: &mut [f32; WIDE * WIDE]) {
+fn sample_rows(image: &GrayU8, b: Vector2<f32>, warp: &Warp, patch: &mut [f32; WIDE * STRIDE]) {
     let (right, bottom) = ((image.width() - 1) as f32, (image.height() - 1) as f32);
     let view = image.view();
     let offset = (WIDE / 2) as f32;
-    for (j, row) in patch.chunks_exact_mut(WIDE).enumerate() {
+    for (j, row) in patch.chunks_exact_mut(STRIDE).enumerate() {
         let [base, linear, square] = warp.row(j as f64 - f64::from(offset));
-        for (i, value) in row.iter_mut().enumerate() {
+        for (i, value) in row[..WIDE].iter_mut().enumerate() {
             let i = i as f32 - offset;
             let p = b + base + linear * i + square * (i * i);
             // Single-precision rounding stays within the image.
@@ -242,39 +273,152 @@ fn sample_rows(image: &GrayU8, b: Vector2<f32>, warp: &Warp, patch: &mut [f32; W
     }
 }
 
+/// The patch of the first photograph, less its mean, and its sums.
+struct Template {
+    /// Rows of [`PADDED`] pixels.
+    values: [f32; SIDE * PADDED],
+    mean: f32,
+    /// Sum of the squares of the values.
+    squares: f64,
+    /// Sums of the values times their column and row, from the center.
+    moments: Vector2<f64>,
+}
+
+impl Template {
+    fn new(pixels: ImageView<'_, u8, 1>) -> Self {
+        let sum: u32 = (0..SIDE).flat_map(|j| pixels.row(j)).map(|v| u32::from(*v)).sum();
+        let mean = sum as f32 / (SIDE * SIDE) as f32;
+        let mut values = [0.0; SIDE * PADDED];
+        let (mut squares, mut moments) = (0.0, Vector2::zeros());
+        for (j, row) in values.chunks_exact_mut(PADDED).enumerate() {
+            for (i, (value, pixel)) in row.iter_mut().zip(pixels.row(j)).enumerate() {
+                *value = f32::from(*pixel) - mean;
+                let t = f64::from(*value);
+                squares += t * t;
+                moments += Vector2::new(offset(i), offset(j)) * t;
+            }
+        }
+        Self { values, mean, squares, moments }
+    }
+}
+
+/// Offset of a row or column of a patch from its center.
+fn offset(k: usize) -> f64 {
+    k as f64 - RADIUS as f64
+}
+
+/// Sums over a patch of products of its gradients `gx` and `gy`, its values `s` and those `t` of the template, both less the template's mean; and row offsets `j`.
+#[derive(Clone, Copy)]
+enum Product {
+    GxGx,
+    GxGy,
+    GxS,
+    GyGy,
+    GyS,
+    SS,
+    TGx,
+    TGy,
+    TS,
+    Gx,
+    Gy,
+    S,
+    JGx,
+    JGy,
+    JS,
+}
+
+/// Displacement, gain, offset and its slopes.
+const UNKNOWNS: usize = 6;
+/// Number of [`Product`]s.
+const PRODUCTS: usize = Product::JS as usize + 1;
+
+/// Sums every product over the columns of a patch, one sum per row position; `None` where a pixel is clipped.
+#[inline(always)]
+fn column_sums(template: &Template, patch: &[f32; WIDE * STRIDE], sums: &mut [[f32; PADDED]; PRODUCTS]) -> bool {
+    let mut greatest = [f32::MIN; PADDED];
+    for left in (0..PADDED).step_by(LANES) {
+        let mut sum = [[0.0_f32; LANES]; PRODUCTS];
+        let mut most = [f32::MIN; LANES];
+        for j in 0..SIDE {
+            let take = |start: usize| -> [f32; LANES] { std::array::from_fn(|k| patch[start + k]) };
+            let start = (j + 1) * STRIDE + left + 1;
+            let (before, row, after) = (take(start - 1), take(start), take(start + 1));
+            let (above, below) = (take(start - STRIDE), take(start + STRIDE));
+            let t: [f32; LANES] = std::array::from_fn(|k| template.values[j * PADDED + left + k]);
+            let down = j as f32 - RADIUS as f32;
+            for k in 0..LANES {
+                let (gx, gy, s) = (0.5 * (after[k] - before[k]), 0.5 * (below[k] - above[k]), row[k] - template.mean);
+                let of = [
+                    gx * gx,
+                    gx * gy,
+                    gx * s,
+                    gy * gy,
+                    gy * s,
+                    s * s,
+                    t[k] * gx,
+                    t[k] * gy,
+                    t[k] * s,
+                    gx,
+                    gy,
+                    s,
+                    down * gx,
+                    down * gy,
+                    down * s,
+                ];
+                for (sum, value) in sum.iter_mut().zip(of) {
+                    sum[k] += value;
+                }
+                most[k] = most[k].max(row[k]);
+            }
+        }
+        for (all, sum) in sums.iter_mut().zip(sum) {
+            all[left..left + LANES].copy_from_slice(&sum);
+        }
+        greatest[left..left + LANES].copy_from_slice(&most);
+    }
+    greatest[..SIDE].iter().all(|v| *v < f32::from(CLIPPED))
+}
+
 /// Computes the displacement `d` of the template in the patch by linear least squares, `T = g (S + ∇S · d) + o(u)`, with an offset `o` that is linear over the patch (vignetting, and
 /// exposure differences); `None` for a low correlation, a large standard error, or clipped pixels.
-fn gauss_newton_step(template: ImageView<'_, u8, 1>, patch: &[f32; WIDE * WIDE]) -> Option<Vector2<f64>> {
-    let (mut normal, mut right) = (SMatrix::<f64, 6, 6>::zeros(), SVector::<f64, 6>::zeros());
-    let (mut sum, mut squares) = (0.0, 0.0);
-    for j in 0..SIDE {
-        for (i, t) in template.row(j).iter().enumerate() {
-            let k = (j + 1) * WIDE + i + 1;
-            let s = f64::from(patch[k]);
-            if s >= f64::from(CLIPPED) {
-                return None;
-            }
-            let gx = 0.5 * f64::from(patch[k + 1] - patch[k - 1]);
-            let gy = 0.5 * f64::from(patch[k + WIDE] - patch[k - WIDE]);
-            let place = |k: usize| k as f64 - RADIUS as f64;
-            let (row, t) = (SVector::from([gx, gy, s, 1.0, place(i), place(j)]), f64::from(*t));
-            normal += row * row.transpose();
-            right += row * t;
-            sum += t;
-            squares += t * t;
-        }
+fn gauss_newton_step(level: Level, template: &Template, patch: &[f32; WIDE * STRIDE]) -> Option<Vector2<f64>> {
+    let mut columns = [[0.0; PADDED]; PRODUCTS];
+    if !dispatch!(level, _simd => column_sums(template, patch, &mut columns)) {
+        return None;
     }
+    let sum = |p: Product| columns[p as usize][..SIDE].iter().map(|v| f64::from(*v)).sum::<f64>();
+    // The same with column offsets.
+    let across = |p: Product| {
+        columns[p as usize][..SIDE].iter().enumerate().map(|(i, v)| offset(i) * f64::from(*v)).sum::<f64>()
+    };
+    use Product::{Gx, GxGx, GxGy, GxS, Gy, GyGy, GyS, JGx, JGy, JS, S, SS, TGx, TGy, TS};
     let n = (SIDE * SIDE) as f64;
+    // Sum of the squares of the offsets along an axis.
+    let spread = SIDE as f64 * (0..SIDE).map(|k| offset(k).powi(2)).sum::<f64>();
+    // The lower triangle of the normal equations: gradients, values, 1, offsets of columns and rows.
+    let rows: [&[f64]; UNKNOWNS] = [
+        &[sum(GxGx)],
+        &[sum(GxGy), sum(GyGy)],
+        &[sum(GxS), sum(GyS), sum(SS)],
+        &[sum(Gx), sum(Gy), sum(S), n],
+        &[across(Gx), across(Gy), across(S), 0.0, spread],
+        &[sum(JGx), sum(JGy), sum(JS), 0.0, 0.0, spread],
+    ];
+    let normal = SMatrix::<f64, UNKNOWNS, UNKNOWNS>::from_fn(|r, c| rows[r.max(c)][r.min(c)]);
+    // The template has a mean of zero.
+    let (t_i, t_j) = (template.moments.x, template.moments.y);
+    let right = SVector::<f64, UNKNOWNS>::from([sum(TGx), sum(TGy), sum(TS), 0.0, t_i, t_j]);
     let inverse = normal.cholesky()?.inverse();
     let solution = inverse * right;
     let gain = solution[2];
     // The residual of a linear fit: squares less what it explains.
-    let (residual, variance) = (squares - solution.dot(&right), squares - sum * sum / n);
-    if !(0.1..10.0).contains(&gain) || residual > (1.0 - MIN_CORRELATION * MIN_CORRELATION) * variance {
+    let residual = template.squares - solution.dot(&right);
+    if !(0.1..10.0).contains(&gain) || residual > (1.0 - MIN_CORRELATION * MIN_CORRELATION) * template.squares {
         return None;
     }
-    let standard_error = (residual.max(0.0) / (n - 6.0) * inverse[(0, 0)].max(inverse[(1, 1)])).sqrt() / gain;
-    if standard_error.is_nan() || standard_error >= MAX_STANDARD_ERROR_PX {
+    let variance = residual.max(0.0) / (n - UNKNOWNS as f64) / (gain * gain);
+    let [along, down] = [inverse[(0, 0)], inverse[(1, 1)]].map(|v| v * variance);
+    if !(along.max(down) < MAX_STANDARD_ERROR_PX * MAX_STANDARD_ERROR_PX) {
         return None;
     }
     let step = Vector2::new(solution[0], solution[1]) / gain;
@@ -335,7 +479,7 @@ mod tests {
             let (from, to) = (&views[i], &views[j]);
             let mut off = Vec::new();
             for m in matches(from, to, 0.7) {
-                if let Some(found) = refine_match(&images[i], &images[j], from, to, &m) {
+                if let Some(found) = refine_match(Level::new(), [&images[i], &images[j]], from, to, &m) {
                     assert_eq!((found.a - m.a).map(|v| v.abs() <= 0.5), Vector2::new(true, true));
                     off.push((found.b - to.project(&from.ray(found.a).unwrap()).unwrap()).norm());
                 }
@@ -354,7 +498,7 @@ mod tests {
         let views = views();
         let images = images(&views);
         let m = matches(&views[0], &views[1], 0.0)[120];
-        let refine = |second: &GrayU8| refine_match(&images[0], second, &views[0], &views[1], &m);
+        let refine = |second: &GrayU8| refine_match(Level::new(), [&images[0], second], &views[0], &views[1], &m);
         assert!(refine(&images[1]).is_some());
         assert_eq!(refine(&GrayU8::new(320, 240, [90])), None);
         assert_eq!(refine(&GrayU8::new(320, 240, [255])), None);
@@ -362,7 +506,7 @@ mod tests {
         assert_eq!(refine(&foreign), None);
         // Off by more than a correction may be.
         let far = Correspondence { b: m.b + Vector2::new(6.0, 0.0), ..m };
-        assert_eq!(refine_match(&images[0], &images[1], &views[0], &views[1], &far), None);
+        assert_eq!(refine_match(Level::new(), [&images[0], &images[1]], &views[0], &views[1], &far), None);
     }
 
     #[test]

@@ -19,6 +19,15 @@ struct TiePoint {
     q: usize,
     a: Point2<f64>,
     b: Point2<f64>,
+    /// Unit normal of the edge, where the position along it is unknown (aperture problem).
+    normal: Option<Vector2<f64>>,
+}
+
+impl TiePoint {
+    /// Returns the component of a displacement that the tie point measures.
+    fn measured(normal: Option<Vector2<f64>>, v: Vector2<f64>) -> Vector2<f64> {
+        normal.map_or(v, |n| n * n.dot(&v))
+    }
 }
 
 /// Grid cells along the side of a photograph.
@@ -116,7 +125,7 @@ fn feature_ties(
                         continue;
                     };
                     if (a - b).norm() < max_displacement {
-                        ties.push(TiePoint { p, q, a, b });
+                        ties.push(TiePoint { p, q, a, b, normal: None });
                     }
                 }
             }
@@ -132,8 +141,8 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
         offsets.push(offsets[offsets.len() - 1] + f.displacement.len());
     }
     let n = offsets[fields.len()];
-    /// A residual: eight vertices with signed weights, and the displacement to be compensated.
-    type Term = ([(usize, f64); 8], Vector2<f64>);
+    /// A residual: eight vertices with signed weights, the displacement to be compensated, and the direction in which it is known.
+    type Term = ([(usize, f64); 8], Vector2<f64>, Option<Vector2<f64>>);
     let terms: Vec<Term> = ties
         .iter()
         .map(|t| {
@@ -141,7 +150,7 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
             let term = |k: usize| {
                 if k < 4 { (offsets[t.p] + a[k].0, a[k].1) } else { (offsets[t.q] + b[k - 4].0, -b[k - 4].1) }
             };
-            (std::array::from_fn(term), t.b - t.a)
+            (std::array::from_fn(term), t.b - t.a, t.normal)
         })
         .collect();
     let mut edges = Vec::new();
@@ -163,8 +172,11 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
     for round in 0..5 {
         // The scale shrinks from round to round (graduated non-convexity).
         let scale = scale * f64::from(1 << (4 - round.min(4)));
-        let weights: Vec<f64> =
-            terms.iter().map(|(t, want)| 1.0 / (1.0 + (left(&d, t) - want).norm_squared() / (scale * scale))).collect();
+        let weight = |(t, want, normal): &Term| {
+            let residual = TiePoint::measured(*normal, left(&d, t) - want);
+            1.0 / (1.0 + residual.norm_squared() / (scale * scale))
+        };
+        let weights: Vec<f64> = terms.iter().map(weight).collect();
         let apply = |x: &[Vector2<f64>]| {
             let mut out: Vec<Vector2<f64>> = x.iter().map(|v| v * DAMPING).collect();
             for &(i, j) in &edges {
@@ -172,8 +184,8 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
                 out[i] += pull;
                 out[j] -= pull;
             }
-            for ((t, _), w) in terms.iter().zip(&weights) {
-                let value = left(x, t) * *w;
+            for ((t, _, normal), w) in terms.iter().zip(&weights) {
+                let value = TiePoint::measured(*normal, left(x, t) * *w);
                 for &(i, c) in t {
                     out[i] += value * c;
                 }
@@ -181,15 +193,17 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
             out
         };
         let mut right = vec![Vector2::zeros(); n];
-        let mut diagonal = vec![DAMPING; n];
+        let mut diagonal = vec![Vector2::repeat(DAMPING); n];
         for &(i, j) in &edges {
-            diagonal[i] += SMOOTHNESS;
-            diagonal[j] += SMOOTHNESS;
+            diagonal[i] += Vector2::repeat(SMOOTHNESS);
+            diagonal[j] += Vector2::repeat(SMOOTHNESS);
         }
-        for ((t, want), w) in terms.iter().zip(&weights) {
+        for ((t, want, normal), w) in terms.iter().zip(&weights) {
+            let want = TiePoint::measured(*normal, *want);
+            let axes = normal.map_or_else(|| Vector2::repeat(1.0), |n| n.component_mul(&n));
             for &(i, c) in t {
                 right[i] += want * (c * w);
-                diagonal[i] += c * c * w;
+                diagonal[i] += axes * (c * c * w);
             }
         }
         conjugate_gradients(apply, &right, &diagonal, &mut d, stage)?;
@@ -205,15 +219,13 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
 fn conjugate_gradients(
     apply: impl Fn(&[Vector2<f64>]) -> Vec<Vector2<f64>>,
     right: &[Vector2<f64>],
-    diagonal: &[f64],
+    diagonal: &[Vector2<f64>],
     x: &mut [Vector2<f64>],
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
-    // The two axes are independent systems with a common matrix.
-    let dot = |a: &[Vector2<f64>], b: &[Vector2<f64>]| -> Vector2<f64> {
-        a.iter().zip(b).map(|(a, b)| a.component_mul(b)).sum()
-    };
-    let scaled = |r: &[Vector2<f64>]| -> Vec<Vector2<f64>> { r.iter().zip(diagonal).map(|(r, d)| r / *d).collect() };
+    let dot = |a: &[Vector2<f64>], b: &[Vector2<f64>]| -> f64 { a.iter().zip(b).map(|(a, b)| a.dot(b)).sum() };
+    let scaled =
+        |r: &[Vector2<f64>]| -> Vec<Vector2<f64>> { r.iter().zip(diagonal).map(|(r, d)| r.component_div(d)).collect() };
     let product = apply(x);
     let mut r: Vec<Vector2<f64>> = right.iter().zip(&product).map(|(b, a)| b - a).collect();
     let mut z = scaled(&r);
@@ -227,21 +239,20 @@ fn conjugate_gradients(
             stage.check()?;
         }
         // Convergence tolerance: a thousandth of a pixel.
-        if rz.x <= 1e-8 * whole.x.max(1e-6) && rz.y <= 1e-8 * whole.y.max(1e-6) {
+        if rz <= 1e-8 * whole.max(1e-6) {
             break;
         }
         let product = apply(&direction);
-        let curvature = dot(&direction, &product);
-        let step = Vector2::new(rz.x / curvature.x.max(1e-300), rz.y / curvature.y.max(1e-300));
+        let step = rz / dot(&direction, &product).max(1e-300);
         for i in 0..x.len() {
-            x[i] += direction[i].component_mul(&step);
-            r[i] -= product[i].component_mul(&step);
+            x[i] += direction[i] * step;
+            r[i] -= product[i] * step;
         }
         z = scaled(&r);
         let next = dot(&r, &z);
-        let keep = Vector2::new(next.x / rz.x.max(1e-300), next.y / rz.y.max(1e-300));
+        let keep = next / rz.max(1e-300);
         for (p, z) in direction.iter_mut().zip(&z) {
-            *p = z + p.component_mul(&keep);
+            *p = z + *p * keep;
         }
         rz = next;
     }
@@ -334,7 +345,10 @@ fn register_overlap(
         let apart = fields[p].at(c) - fields[q].at(c);
         let is_known = match (&site.tie, site.registered_at) {
             _ if site.is_low_texture => true,
-            (Some(tie), _) => (tie.a + fields[p].at(tie.a) - tie.b - fields[q].at(tie.b)).norm() < CONVERGED_PX,
+            (Some(tie), _) => {
+                let residual = tie.a + fields[p].at(tie.a) - tie.b - fields[q].at(tie.b);
+                TiePoint::measured(tie.normal, residual).norm() < CONVERGED_PX
+            }
             (None, Some(before)) => (apart - before).norm() < MIN_FIELD_CHANGE_PX,
             (None, None) => false,
         };
@@ -342,37 +356,53 @@ fn register_overlap(
             return Ok(());
         }
         (site.tie, site.registered_at) = (None, Some(apart));
-        let Some(first) = patch(photos[0], layout, &fields[p], p, c, PATCH_RADIUS) else { return Ok(()) };
-        site.is_low_texture = corner_strength(&first) < MIN_CORNER_STRENGTH;
-        if !site.is_low_texture
-            && let Some(second) = patch(photos[1], layout, &fields[q], q, c, PATCH_RADIUS + SEARCH_RADIUS)
+        let sample = |side: usize, axis: Vector2<f64>, along: usize, across: usize| {
+            let k = [p, q][side];
+            patch(photos[side], layout, &fields[k], k, c, axis, (along, across))
+        };
+        let (wide, right) = (PATCH_RADIUS + SEARCH_RADIUS, Vector2::x());
+        let Some(first) = sample(0, right, PATCH_RADIUS, PATCH_RADIUS) else { return Ok(()) };
+        let tensor = structure_tensor(&first);
+        site.is_low_texture = tensor.strengths[1] < MIN_CORNER_STRENGTH && !tensor.is_edge();
+        let tie = |offset: Vector2<f64>, normal: Option<Vector2<f64>>| {
+            let other = c + offset;
+            TiePoint { p, q, a: c - fields[p].at(c), b: other - fields[q].at(other), normal }
+        };
+        if tensor.strengths[1] >= MIN_CORNER_STRENGTH
+            && let Some(second) = sample(1, right, wide, wide)
             && let Some(offset) = register(&first, second)
         {
-            let other = c + offset;
-            site.tie = Some(TiePoint { p, q, a: c - fields[p].at(c), b: other - fields[q].at(other) });
+            site.tie = Some(tie(offset, None));
+        } else if tensor.is_edge()
+            && let Some(first) = sample(0, tensor.normal, PATCH_RADIUS, PATCH_RADIUS)
+            && let Some(second) = sample(1, tensor.normal, wide, PATCH_RADIUS)
+            && let Some(offset) = register_edge(&first, &second)
+        {
+            site.tie = Some(tie(tensor.normal * offset, Some(tensor.normal)));
         }
         Ok(())
     })
 }
 
-/// Samples a placement around a canvas pixel, side `2 radius + 1`; `None` where the patch is not completely inside the photograph.
+/// Samples a placement around a canvas pixel in rows along a unit vector, of sides `2 along + 1` and `2 across + 1`; `None` where the patch is not completely inside the photograph.
 fn patch(
     photo: &GrayU8,
     layout: &Layout,
     field: &DisplacementField,
     p: usize,
     c: Point2<f64>,
-    radius: usize,
+    axis: Vector2<f64>,
+    (along, across): (usize, usize),
 ) -> Option<Vec<f32>> {
     let placement = &layout.placements[p];
     let to_pixel =
         |c: Point2<f64>| placement.view.project(&layout.surface.inverse(c - field.at(c) + placement.origin.coords));
     // The map is affine to first order over a patch.
-    let h = radius as f64;
+    let (w, h) = (along as f64, across as f64);
     let middle = to_pixel(c)?;
-    let (right, down) = (to_pixel(c + Vector2::new(h, 0.0))?, to_pixel(c + Vector2::new(0.0, h))?);
-    let (ux, uy) = ((right - middle) / h, (down - middle) / h);
-    for (i, j) in [(-h, -h), (h, -h), (-h, h), (h, h)] {
+    let (right, down) = (to_pixel(c + axis * w)?, to_pixel(c + Vector2::new(-axis.y, axis.x) * h)?);
+    let (ux, uy) = ((right - middle) / w, (down - middle) / h);
+    for (i, j) in [(-w, -h), (w, -h), (-w, h), (w, h)] {
         let corner = middle + ux * i + uy * j;
         let inside = corner.x >= 0.0
             && corner.y >= 0.0
@@ -382,19 +412,25 @@ fn patch(
             return None;
         }
     }
-    let side = 2 * radius + 1;
-    let mut values = vec![0.0; side * side];
+    let side = 2 * along + 1;
+    let mut values = vec![0.0; side * (2 * across + 1)];
     let (middle, ux, uy) = (middle.coords.cast::<f32>(), ux.cast::<f32>(), uy.cast::<f32>());
-    let corner = middle - (ux + uy) * radius as f32;
-    dispatch!(Level::new(), _simd => sample_patch(photo, corner, ux, uy, &mut values));
+    let corner = middle - ux * along as f32 - uy * across as f32;
+    dispatch!(Level::new(), _simd => sample_patch(photo, corner, ux, uy, side, &mut values));
     Some(values)
 }
 
-/// Samples the positions `corner + i ux + j uy` of a square inside the image.
+/// Samples the positions `corner + i ux + j uy` of a rectangle, `side` wide, inside the image.
 #[inline(always)]
-fn sample_patch(photo: &GrayU8, corner: Vector2<f32>, ux: Vector2<f32>, uy: Vector2<f32>, values: &mut [f32]) {
+fn sample_patch(
+    photo: &GrayU8,
+    corner: Vector2<f32>,
+    ux: Vector2<f32>,
+    uy: Vector2<f32>,
+    side: usize,
+    values: &mut [f32],
+) {
     let (width, height) = photo.size();
-    let side = values.len().isqrt();
     let (right, bottom) = ((width - 2) as f32, (height - 2) as f32);
     let view = photo.view();
     for (j, row) in values.chunks_exact_mut(side).enumerate() {
@@ -408,8 +444,26 @@ fn sample_patch(photo: &GrayU8, corner: Vector2<f32>, ux: Vector2<f32>, uy: Vect
     }
 }
 
-/// Computes the smaller eigenvalue of the mean structure tensor of a patch (Shi & Tomasi 1994).
-fn corner_strength(patch: &[f32]) -> f32 {
+/// Eigenvalues of the mean structure tensor of a patch (Shi & Tomasi 1994).
+struct StructureTensor {
+    /// The larger and the smaller eigenvalue.
+    strengths: [f32; 2],
+    /// Unit eigenvector of the larger.
+    normal: Vector2<f64>,
+}
+
+/// Minimum larger eigenvalue of an edge: gradients of 6 gray levels per pixel.
+const MIN_EDGE_STRENGTH: f32 = 36.0;
+/// Minimum ratio of the eigenvalues of an edge. Texture such as grass around a painted line leaves little more.
+const MIN_EDGE_RATIO: f32 = 1.5;
+
+impl StructureTensor {
+    fn is_edge(&self) -> bool {
+        self.strengths[0] >= MIN_EDGE_STRENGTH && self.strengths[0] >= MIN_EDGE_RATIO * self.strengths[1]
+    }
+}
+
+fn structure_tensor(patch: &[f32]) -> StructureTensor {
     let side = 2 * PATCH_RADIUS + 1;
     let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
     for r in 1..side - 1 {
@@ -422,7 +476,52 @@ fn corner_strength(patch: &[f32]) -> f32 {
         }
     }
     let n = ((side - 2) * (side - 2)) as f32;
-    (0.5 * (xx + yy) - (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt()) / n
+    let (mean, half) = (0.5 * (xx + yy), (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt());
+    let angle = 0.5 * f64::from(2.0 * xy).atan2(f64::from(xx - yy));
+    StructureTensor {
+        strengths: [(mean + half) / n, (mean - half) / n],
+        normal: Vector2::new(angle.cos(), angle.sin()),
+    }
+}
+
+/// Minimum correlation of registered profiles: means along the edge, whose noise is a quarter of that of a pixel.
+const MIN_PROFILE_CORRELATION: f32 = 0.9;
+
+/// Estimates the displacement across an edge: `first` and the longer `second` have their rows across it, whose means are correlated. `None` for a low or ambiguous maximum.
+fn register_edge(first: &[f32], second: &[f32]) -> Option<f64> {
+    const SIDE: usize = 2 * PATCH_RADIUS + 1;
+    const WIDE: usize = SIDE + 2 * SEARCH_RADIUS;
+    let (mut ours, mut theirs) = ([0.0_f32; SIDE], [0.0_f32; WIDE]);
+    for row in first.as_chunks::<SIDE>().0 {
+        ours.iter_mut().zip(row).for_each(|(sum, v)| *sum += v);
+    }
+    for row in second.as_chunks::<WIDE>().0 {
+        theirs.iter_mut().zip(row).for_each(|(sum, v)| *sum += v);
+    }
+    let centered = |values: &[f32]| -> ([f32; SIDE], f32) {
+        let mean = values.iter().sum::<f32>() / SIDE as f32;
+        let centered: [f32; SIDE] = std::array::from_fn(|i| values[i] - mean);
+        (centered, centered.iter().map(|v| v * v).sum())
+    };
+    let (ours, energy) = centered(&ours);
+    let scores: [f32; SEARCH_SIDE] = std::array::from_fn(|shift| {
+        let (theirs, other) = centered(&theirs[shift..shift + SIDE]);
+        ours.iter().zip(theirs).map(|(a, b)| a * b).sum::<f32>() / (energy * other).sqrt().max(1e-3)
+    });
+    let (best, &score) = scores.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
+    if score.is_nan() || score < MIN_PROFILE_CORRELATION || best == 0 || best == SEARCH_SIDE - 1 {
+        return None;
+    }
+    if scores.iter().enumerate().any(|(i, s)| i.abs_diff(best) > 2 && *s > score - AMBIGUITY) {
+        return None;
+    }
+    Some(best as f64 + peak(scores[best - 1], score, scores[best + 1]) - SEARCH_RADIUS as f64)
+}
+
+/// Returns the offset of the maximum of the parabola through three neighboring scores from the middle one.
+fn peak(a: f32, b: f32, c: f32) -> f64 {
+    let curvature = a - 2.0 * b + c;
+    if curvature < 0.0 { f64::from(0.5 * (a - c) / curvature).clamp(-0.5, 0.5) } else { 0.0 }
 }
 
 /// Minimum correlation of registered patches.
@@ -448,12 +547,8 @@ fn register(first: &[f32], mut second: Vec<f32>) -> Option<Vector2<f64>> {
     if is_ambiguous {
         return None;
     }
-    let parabola = |a: f32, b: f32, c: f32| {
-        let curvature = a - 2.0 * b + c;
-        if curvature < 0.0 { f64::from(0.5 * (a - c) / curvature).clamp(-0.5, 0.5) } else { 0.0 }
-    };
-    let fx = parabola(scores[best - 1], score, scores[best + 1]);
-    let fy = parabola(scores[best - SEARCH_SIDE], score, scores[best + SEARCH_SIDE]);
+    let fx = peak(scores[best - 1], score, scores[best + 1]);
+    let fy = peak(scores[best - SEARCH_SIDE], score, scores[best + SEARCH_SIDE]);
     Some(Vector2::new(x as f64 + fx - SEARCH_RADIUS as f64, y as f64 + fy - SEARCH_RADIUS as f64))
 }
 
@@ -461,7 +556,7 @@ fn register(first: &[f32], mut second: Vec<f32>) -> Option<Vector2<f64>> {
 mod tests {
     use super::*;
     use crate::align::{CameraMotion, View};
-    use crate::surface::{Framing, PhotoMap, Projection, layout};
+    use crate::surface::{Bounds, Framing, PhotoMap, Projection, layout};
     use crate::testing::{StopAt, photograph, sky, stage};
     use cv_core::{Camera, Correspondence, Silent, Vector3};
     use nalgebra::{DMatrix, DVector, Rotation3};
@@ -576,7 +671,7 @@ mod tests {
         let apply = |x: &[Vector2<f64>]| -> Vec<Vector2<f64>> {
             (0..n).map(|i| (0..n).map(|j| x[j] * matrix[(i, j)]).sum()).collect()
         };
-        let diagonal: Vec<f64> = (0..n).map(|i| matrix[(i, i)]).collect();
+        let diagonal: Vec<Vector2<f64>> = (0..n).map(|i| Vector2::repeat(matrix[(i, i)])).collect();
         let mut x = vec![Vector2::new(0.5, -0.5); n];
         conjugate_gradients(apply, &right, &diagonal, &mut x, &stage()).unwrap();
         for axis in 0..2 {
@@ -608,9 +703,44 @@ mod tests {
         // Unrelated patches.
         let side = 2 * (PATCH_RADIUS + SEARCH_RADIUS) + 1;
         assert_eq!(register(&first, vec![128.0; side * side]), None);
-        assert!(corner_strength(&first) > MIN_CORNER_STRENGTH);
+        assert!(structure_tensor(&first).strengths[1] > MIN_CORNER_STRENGTH);
         // One direction only: the smaller eigenvalue of the structure tensor is zero.
         let edge: Vec<f32> = (0..17 * 17).map(|i| if i % 17 < 8 { 10.0 } else { 200.0 }).collect();
-        assert!(corner_strength(&edge).abs() < 1e-2);
+        let tensor = structure_tensor(&edge);
+        assert!(tensor.strengths[1].abs() < 1e-2 && tensor.is_edge() && (tensor.normal.x.abs() - 1.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn an_edge_in_noise_is_registered_across_and_ties_only_in_that_direction() {
+        let mut state = 5_u32;
+        let mut noise = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            60.0 * ((state >> 8) as f32 / (1 << 24) as f32 - 0.5)
+        };
+        // A painted line, three pixels wide, in grass that differs; rows across it.
+        let mut profile = |radius: usize, at: f32| -> Vec<f32> {
+            let line = |i: i32| 70.0 * (2.0 - (i as f32 - at).abs()).clamp(0.0, 1.0);
+            let h = radius as i32;
+            (0..2 * PATCH_RADIUS + 1).flat_map(|_| -h..=h).map(|i| 100.0 + line(i) + noise()).collect()
+        };
+        let first = profile(PATCH_RADIUS, 0.0);
+        for offset in [0.0, 4.0, -3.4] {
+            let found = register_edge(&first, &profile(PATCH_RADIUS + SEARCH_RADIUS, offset)).unwrap();
+            // Means of 17 pixels with noise of 17 levels, on slopes of 70 levels a pixel, and a parabola through a corner.
+            assert!((found - f64::from(offset)).abs() < 0.3, "{offset} {found}");
+        }
+        assert_eq!(register_edge(&first, &vec![100.0; 17 * 33]), None);
+        // A tie point along x leaves y to the damping.
+        let bounds = Bounds { left: 0, top: 0, right: 200, bottom: 100 };
+        let mut fields = vec![DisplacementField::over(&bounds, 10.0), DisplacementField::over(&bounds, 10.0)];
+        let at = |x: f64, y: f64| Point2::new(x, y);
+        let ties: Vec<TiePoint> = (0..40)
+            .map(|k| at(20.0 + 20.0 * f64::from(k % 8), 10.0 + 18.0 * f64::from(k / 8)))
+            .map(|a| TiePoint { p: 0, q: 1, a, b: a + Vector2::new(3.0, 7.0), normal: Some(Vector2::x()) })
+            .collect();
+        solve(&mut fields, &ties, 3.0, &stage()).unwrap();
+        let apart = fields[0].at(at(100.0, 50.0)) - fields[1].at(at(100.0, 50.0));
+        // The damping, 0.006 a vertex, takes a hundredth of it.
+        assert!((apart.x - 3.0).abs() < 0.1 && apart.y.abs() < 1e-6, "{apart}");
     }
 }

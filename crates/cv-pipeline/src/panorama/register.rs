@@ -1,11 +1,11 @@
 //! Registration of photographs: features, matching, verification of pairs, alignment.
 
 use crate::Progress;
-use crate::matching::{MatchingOptions, correspondences, extract_features, match_features, rescale};
+use crate::matching::{MatchingOptions, correspondences, match_features, rescale};
 use crate::panorama::{
     LeftOut, NearestPair, PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto,
 };
-use cv_core::{Camera, Cancelled, GrayU8, Scaling, Stage, StageClock, UnionFind};
+use cv_core::{Camera, Cancelled, GrayF32, GrayU8, Scaling, Stage, StageClock, UnionFind};
 use cv_features::{FeatureError, FeatureOptions, Features, MatchError, SiftOptions};
 use cv_panorama::{
     AlignError, Alignment, PairRejection, Photo, Unplaced, VerifiedPair, align, refine_alignment, verify_pair,
@@ -31,29 +31,36 @@ pub(super) fn register(
     let n = photos.count();
     let indices: Vec<usize> = (0..n).collect();
     let candidates: Vec<(usize, usize)> = (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b))).collect();
+    let mut prepared: Vec<Prepared> = Vec::with_capacity(n);
+    {
+        let stage = Stage::new(progress, "features", n)?;
+        let resize = |p: &PanoramaPhoto<'_>| {
+            stage.check()?;
+            Ok(Prepared::new(p, &options.matching, options.registration_pixels))
+        };
+        for batch in indices.chunks(photos.at_once()) {
+            let batch = batch.par_iter().map(|index| photos.prepare(*index, &resize));
+            prepared.extend(batch.collect::<Result<Vec<_>, _>>()?);
+        }
+    }
     let mut extract_and_match =
-        |matching: &MatchingOptions| -> Result<(Vec<Prepared>, Vec<Option<MatchedPair>>), PanoramaError> {
+        |prepared: &mut [Prepared], matching: &MatchingOptions| -> Result<Vec<Option<MatchedPair>>, Cancelled> {
             let stage = Stage::new(progress, "features", n)?;
-            let extract = |&index: &usize| -> Result<Prepared, PanoramaError> {
-                let prepare = |p: &PanoramaPhoto<'_>| Prepared::new(p, matching, options.registration_pixels, &stage);
-                let prepared = photos.prepare(index, &prepare)?;
-                stage.add(1)?;
-                Ok(prepared)
-            };
-            let mut prepared: Vec<Prepared> = Vec::with_capacity(n);
-            for batch in indices.chunks(photos.at_once()) {
-                prepared.extend(batch.par_iter().map(extract).collect::<Result<Vec<_>, _>>()?);
-            }
+            prepared.par_iter_mut().try_for_each(|p| {
+                p.extract(matching, &stage)?;
+                stage.add(1)
+            })?;
             clock.lap("features");
+            let prepared = &*prepared;
             let stage = Stage::new(progress, "match", candidates.len())?;
             let compare = |&(a, b): &(usize, usize)| -> Result<Option<MatchedPair>, Cancelled> {
-                let pair = try_pair(&prepared, a, b, options, &stage)?;
+                let pair = try_pair(prepared, a, b, options, &stage)?;
                 stage.add(1)?;
                 Ok(pair)
             };
             let matched = candidates.par_iter().map(compare).collect::<Result<_, Cancelled>>()?;
             clock.lap("match");
-            Ok((prepared, matched))
+            Ok(matched)
         };
     let matching = &options.matching;
     // The upsampled octave takes most of the time of SIFT, and low-contrast features are less accurate: both are used only where needed.
@@ -64,9 +71,9 @@ pub(super) fn register(
         }
         _ => None,
     };
-    let (mut prepared, mut matched) = extract_and_match(plain.as_ref().unwrap_or(matching))?;
+    let mut matched = extract_and_match(&mut prepared, plain.as_ref().unwrap_or(matching))?;
     if plain.is_some() && !is_strongly_connected(n, &matched) {
-        (prepared, matched) = extract_and_match(matching)?;
+        matched = extract_and_match(&mut prepared, matching)?;
     }
     let (pairs, verified): (Vec<PanoramaPair>, Vec<Option<VerifiedPair>>) = matched.into_iter().flatten().unzip();
     let verified: Vec<VerifiedPair> = verified.into_iter().flatten().collect();
@@ -79,8 +86,7 @@ pub(super) fn register(
             return Err(PanoramaError::Align { source, images: describe(&prepared, &views, &pairs) });
         }
     };
-    let grays: Vec<GrayU8> =
-        prepared.iter_mut().map(|p| std::mem::replace(&mut p.gray, GrayU8::new(0, 0, [0]))).collect();
+    let grays: Vec<GrayU8> = prepared.par_iter_mut().map(Prepared::take_gray).collect();
     let alignment = refine_alignment(&grays, &known, &verified, alignment, &options.align, progress)?;
     let mut images = describe(&prepared, &alignment.views, &pairs);
     let sizes: Vec<_> = prepared.iter().enumerate().map(|(index, p)| (p.factor, photos.size(index))).collect();
@@ -93,7 +99,7 @@ pub(super) fn register(
     Ok(Registered { alignment, images, pairs, features, clock })
 }
 
-/// A function of a photograph that extracts its features.
+/// A function that prepares a photograph for the extraction of its features.
 pub(super) type Prepare<'a> = dyn Fn(&PanoramaPhoto<'_>) -> Result<Prepared, Cancelled> + 'a;
 
 /// Photographs to register, in memory or loaded one after the other.
@@ -133,20 +139,16 @@ pub(super) struct Prepared {
     photo: Photo,
     /// Size of the photograph relative to the resized one.
     factor: f64,
-    /// The resized photograph.
-    gray: GrayU8,
+    /// Luma of the resized photograph.
+    gray: GrayF32,
     features: Features,
     /// Why feature extraction failed.
     failure: Option<FeatureError>,
 }
 
 impl Prepared {
-    fn new(
-        p: &PanoramaPhoto<'_>,
-        matching: &MatchingOptions,
-        registration_pixels: usize,
-        progress: &dyn Progress,
-    ) -> Result<Self, Cancelled> {
+    /// Resizes a photograph for registration; without features yet.
+    fn new(p: &PanoramaPhoto<'_>, matching: &MatchingOptions, registration_pixels: usize) -> Self {
         let (w, h) = p.image.size();
         let factor = ((w * h) as f64 / registration_pixels.max(10_000) as f64).sqrt().max(1.0);
         let size = ((w as f64 / factor).round() as usize, (h as f64 / factor).round() as usize);
@@ -155,16 +157,28 @@ impl Prepared {
             Some(small) => (small.view(), w as f64 / size.0 as f64),
             None => (p.image, 1.0),
         };
-        let (features, failure) = match extract_features(image, &matching.features, progress) {
-            Ok(features) => (features, None),
-            Err(FeatureError::Cancelled(stop)) => return Err(stop),
-            Err(error) => (Features::new(matching.features.extractor().kind()), Some(error)),
-        };
         let (width, height) = image.size();
         let camera = p.camera.map(|c| Camera { width, height, ..c.scaled(1.0 / factor) });
         let photo = Photo { width, height, focal: p.focal.map(|f| f / factor), camera };
-        let gray = cv_imgproc::rgb_to_gray(image);
-        Ok(Self { photo, factor, gray, features, failure })
+        let features = Features::new(matching.features.extractor().kind());
+        Self { photo, factor, gray: cv_imgproc::rgb_to_gray_f32(image), features, failure: None }
+    }
+
+    /// Extracts the features.
+    fn extract(&mut self, matching: &MatchingOptions, progress: &dyn Progress) -> Result<(), Cancelled> {
+        let extractor = matching.features.extractor();
+        (self.features, self.failure) = match extractor.extract(self.gray.view(), progress) {
+            Ok(features) => (features, None),
+            Err(FeatureError::Cancelled(stop)) => return Err(stop),
+            Err(error) => (Features::new(extractor.kind()), Some(error)),
+        };
+        Ok(())
+    }
+
+    /// Rounds the luma to gray levels, and frees it.
+    fn take_gray(&mut self) -> GrayU8 {
+        let gray = std::mem::replace(&mut self.gray, GrayF32::new(0, 0, [0.0]));
+        cv_imgproc::f32_to_u8(gray.view())
     }
 
     /// Returns the features in pixels of the photograph.
