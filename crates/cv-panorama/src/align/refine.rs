@@ -418,7 +418,7 @@ fn gauss_newton_step(level: Level, template: &Template, patch: &[f32; WIDE * STR
     }
     let variance = residual.max(0.0) / (n - UNKNOWNS as f64) / (gain * gain);
     let [along, down] = [inverse[(0, 0)], inverse[(1, 1)]].map(|v| v * variance);
-    if !(along.max(down) < MAX_STANDARD_ERROR_PX * MAX_STANDARD_ERROR_PX) {
+    if (along + down).is_nan() || along.max(down) >= MAX_STANDARD_ERROR_PX * MAX_STANDARD_ERROR_PX {
         return None;
     }
     let step = Vector2::new(solution[0], solution[1]) / gain;

@@ -82,7 +82,7 @@ impl<T: PhotoSample> RowSink<T> for Collected<T> {
             self.labels.extend_from_slice(labels.row(y));
         }
         self.strips += 1;
-        if self.labels.len() > self.fails_at * self.size.0 { Err(NotWritten) } else { Ok(()) }
+        if self.labels.len() > self.fails_at.saturating_mul(self.size.0) { Err(NotWritten) } else { Ok(()) }
     }
 }
 

@@ -5,6 +5,7 @@
 //! damping term (zero displacement without data); it is minimized by iteratively reweighted least squares.
 
 use crate::align::Alignment;
+use crate::surface::structure_tensor::StructureTensor;
 use crate::surface::{DisplacementField, Layout, PAD, Placement, SEARCH_RADIUS, SEARCH_SIDE, Surface, Template};
 use cv_core::{Cancelled, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
 use cv_imgproc::bilinear_at;
@@ -362,7 +363,7 @@ fn register_overlap(
         };
         let (wide, right) = (PATCH_RADIUS + SEARCH_RADIUS, Vector2::x());
         let Some(first) = sample(0, right, PATCH_RADIUS, PATCH_RADIUS) else { return Ok(()) };
-        let tensor = structure_tensor(&first);
+        let tensor = StructureTensor::of(&first);
         site.is_low_texture = tensor.strengths[1] < MIN_CORNER_STRENGTH && !tensor.is_edge();
         let tie = |offset: Vector2<f64>, normal: Option<Vector2<f64>>| {
             let other = c + offset;
@@ -441,46 +442,6 @@ fn sample_patch(
             let (x, y) = (u.min(right) as usize, v.min(bottom) as usize);
             [*value] = bilinear_at(view, x, y, u - x as f32, v - y as f32);
         }
-    }
-}
-
-/// Eigenvalues of the mean structure tensor of a patch (Shi & Tomasi 1994).
-struct StructureTensor {
-    /// The larger and the smaller eigenvalue.
-    strengths: [f32; 2],
-    /// Unit eigenvector of the larger.
-    normal: Vector2<f64>,
-}
-
-/// Minimum larger eigenvalue of an edge: gradients of 6 gray levels per pixel.
-const MIN_EDGE_STRENGTH: f32 = 36.0;
-/// Minimum ratio of the eigenvalues of an edge. Texture such as grass around a painted line leaves little more.
-const MIN_EDGE_RATIO: f32 = 1.5;
-
-impl StructureTensor {
-    fn is_edge(&self) -> bool {
-        self.strengths[0] >= MIN_EDGE_STRENGTH && self.strengths[0] >= MIN_EDGE_RATIO * self.strengths[1]
-    }
-}
-
-fn structure_tensor(patch: &[f32]) -> StructureTensor {
-    let side = 2 * PATCH_RADIUS + 1;
-    let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
-    for r in 1..side - 1 {
-        for c in 1..side - 1 {
-            let i = r * side + c;
-            let (gx, gy) = (0.5 * (patch[i + 1] - patch[i - 1]), 0.5 * (patch[i + side] - patch[i - side]));
-            xx += gx * gx;
-            xy += gx * gy;
-            yy += gy * gy;
-        }
-    }
-    let n = ((side - 2) * (side - 2)) as f32;
-    let (mean, half) = (0.5 * (xx + yy), (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt());
-    let angle = 0.5 * f64::from(2.0 * xy).atan2(f64::from(xx - yy));
-    StructureTensor {
-        strengths: [(mean + half) / n, (mean - half) / n],
-        normal: Vector2::new(angle.cos(), angle.sin()),
     }
 }
 
@@ -703,10 +664,10 @@ mod tests {
         // Unrelated patches.
         let side = 2 * (PATCH_RADIUS + SEARCH_RADIUS) + 1;
         assert_eq!(register(&first, vec![128.0; side * side]), None);
-        assert!(structure_tensor(&first).strengths[1] > MIN_CORNER_STRENGTH);
+        assert!(StructureTensor::of(&first).strengths[1] > MIN_CORNER_STRENGTH);
         // One direction only: the smaller eigenvalue of the structure tensor is zero.
         let edge: Vec<f32> = (0..17 * 17).map(|i| if i % 17 < 8 { 10.0 } else { 200.0 }).collect();
-        let tensor = structure_tensor(&edge);
+        let tensor = StructureTensor::of(&edge);
         assert!(tensor.strengths[1].abs() < 1e-2 && tensor.is_edge() && (tensor.normal.x.abs() - 1.0).abs() < 1e-9);
     }
 

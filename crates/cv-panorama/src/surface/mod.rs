@@ -16,6 +16,7 @@ mod plane;
 mod preview;
 mod spherical;
 mod stereographic;
+mod structure_tensor;
 mod warp;
 
 pub use bounds::Bounds;
