@@ -43,7 +43,7 @@ impl Frame<'_> {
     /// Returns the indices whose correspondence is inside the right image: its column decreases with the index, so that the first ones may
     /// be right of the image and the last ones left of it.
     #[inline(always)]
-    fn inside(&self, x: usize) -> Range<usize> {
+    pub(crate) fn inside(&self, x: usize) -> Range<usize> {
         let column = x as i64 - self.min_disparity;
         let n = self.disparities as i64;
         (column - (self.width as i64 - 1)).clamp(0, n) as usize..(column + 1).clamp(0, n) as usize
