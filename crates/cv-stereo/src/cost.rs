@@ -130,7 +130,7 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
     }
     if let Some(priors) = frame.priors.get(y * width..(y + 1) * width) {
         for (prior, out) in priors[xs.clone()].iter().zip(out.chunks_exact_mut(groups * group)) {
-            if prior.cap > 0 {
+            if prior.cap() > 0 {
                 add_prior::<S, BLOCKS>(simd, *prior, out);
             }
         }
@@ -180,10 +180,10 @@ fn add_prior<S: Simd, const BLOCKS: usize>(simd: S, prior: Prior, out: &mut [u8]
     let group = BLOCKS * BLOCK;
     let n = group / lanes;
     let first = S::u8s::from_fn(simd, |lane| (lane * n) as u8);
-    let (cap, one) = (S::u8s::splat(simd, prior.cap), S::u8s::splat(simd, 1));
+    let (cap, one) = (S::u8s::splat(simd, prior.cap()), S::u8s::splat(simd, 1));
     for (g, out) in out.chunks_exact_mut(group).enumerate() {
         // Groups have at most 128 indices: outside its own group, a prior is only required to be farther than the cap.
-        let local = i32::from(prior.index) - (g * group) as i32;
+        let local = i32::from(prior.index()) - (g * group) as i32;
         let (at, beyond) = (local.clamp(0, 255) as u8, (-local).clamp(0, 127) as u8);
         let (at, beyond) = (S::u8s::splat(simd, at), S::u8s::splat(simd, beyond));
         for v in 0..n {

@@ -19,6 +19,7 @@
 //! Disparity is `x_left − x_right` in pixels, `f32`, NaN where unknown.
 
 mod aligned_buffer;
+mod buffer_pool;
 mod census;
 mod coarse_prior;
 mod confidence;

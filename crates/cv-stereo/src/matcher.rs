@@ -5,7 +5,7 @@ use crate::coarse_prior::{Prior, classify_texture, set_priors};
 use crate::confidence::{confidence, sigma};
 use crate::cost::{Frame, Penalties};
 use crate::disparity_map::{DisparityMap, PixelState};
-use crate::edge_preserving::{Planes, smooth};
+use crate::edge_preserving::{SmoothingBuffers, smooth};
 use crate::input::to_gray;
 use crate::layout::Layout;
 use crate::local_expansion;
@@ -66,7 +66,9 @@ pub struct StereoMatcher {
     speckles: Speckles,
     filling: Filling,
     scratch: Vec<f32>,
-    planes: Planes,
+    smoothing: SmoothingBuffers,
+    /// Buffers of the threads of hierarchical matching.
+    window_sweeps: Vec<window_sweep::Buffers>,
     /// Priors of low-texture pixels; empty without any.
     priors: Vec<Prior>,
     /// Search windows of hierarchical matching.
@@ -101,7 +103,8 @@ impl StereoMatcher {
             speckles: Speckles::default(),
             filling: Filling::default(),
             scratch: Vec::new(),
-            planes: Planes::default(),
+            smoothing: SmoothingBuffers::default(),
+            window_sweeps: Vec::new(),
             priors: Vec::new(),
             windows: SearchWindows::default(),
             coarse: None,
@@ -327,7 +330,8 @@ impl StereoMatcher {
         } else if has_priors {
             set_priors(self.level, map.disparity.as_slice(), width / 2, width, range, &mut self.priors);
         }
-        self.coarse = Some(coarse);
+        // Freed where images are large: its memory serves the buffers of this level.
+        self.coarse = (!is_hierarchical).then_some(coarse);
         Ok(())
     }
 
@@ -366,7 +370,8 @@ impl StereoMatcher {
             winners.resize(width * height, Winner::default());
             right.resize(width * height, 0);
             let frame = frame(0..height);
-            return window_sweep::aggregate(self.level, &frame, &self.windows, eight, (winners, right), &stage);
+            let (windows, buffers) = (&self.windows, &mut self.window_sweeps);
+            return window_sweep::aggregate(self.level, &frame, windows, eight, buffers, (winners, right), &stage);
         }
         let run = |aggregator: &mut Aggregator, rows: Range<usize>| -> Result<(), Cancelled> {
             aggregator.run(self.level, &frame(rows), eight, &stage)
@@ -424,13 +429,13 @@ impl StereoMatcher {
         }
         if options.median > 0 {
             median::median(self.level, disparity, width, options.median, &mut self.scratch);
-            disparity
-                .par_chunks_mut(1 << 16)
-                .zip(self.scratch.par_chunks(1 << 16))
-                .for_each(|(d, s)| d.copy_from_slice(s));
             stage.add(1)?;
+        } else {
+            self.scratch.clear();
+            self.scratch.extend_from_slice(disparity);
         }
-        smooth(self.level, options.smoothing, disparity, states, &self.gray8, width, &mut self.planes, &stage)?;
+        let (source, gray, buffers) = (&self.scratch, &self.gray8, &mut self.smoothing);
+        smooth(self.level, options.smoothing, source, disparity, states, gray, width, buffers, &stage)?;
         stage.add(1)?;
         // Without any match there is nothing to improve.
         if options.quality && disparity.iter().all(|d| d.is_finite()) {

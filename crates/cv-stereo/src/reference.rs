@@ -28,8 +28,9 @@ pub(crate) fn match_reference(
         (left[i] ^ right[j]).count_ones() as u8 + more.min(options.intensity_cost.cap())
     };
     let prior_cost = |i: usize, k: usize| {
-        let cost =
-            |prior: &Prior| usize::from(prior.index).abs_diff(k).saturating_sub(1).min(usize::from(prior.cap)) as u8;
+        let cost = |prior: &Prior| {
+            usize::from(prior.index()).abs_diff(k).saturating_sub(1).min(usize::from(prior.cap())) as u8
+        };
         priors.get(i).map_or(0, cost)
     };
     let costs: Vec<u8> = (0..width * height)
@@ -231,7 +232,7 @@ mod tests {
             let right: Vec<u16> = (0..width * height).map(|i| noise(if i % 5 == 0 { i + 7 } else { i + 3 })).collect();
             let bits = [&left, &right].map(|g| census_reference(g, width, height, options.census));
             let blended = [&left, &right].map(|g| intensity_reference(g, width, options.intensity_cost));
-            let prior = |i: usize| Prior { index: (noise(i + 11) as usize * 31 % disparities) as u16, cap: (noise(i + 5) % 4) as u8 };
+            let prior = |i: usize| Prior::new((noise(i + 11) as usize * 31 % disparities) as u16, (noise(i + 5) % 4) as u8);
             let priors: Vec<Prior> = if has_priors { (0..width * height).map(prior).collect() } else { Vec::new() };
             let expected = match_reference(&options, &left, [&bits[0], &bits[1]], &blended, &priors, width, height);
 

@@ -5,6 +5,7 @@
 //! two windows; disparities outside the neighbor's window cost P2. The winners of the right view are the cheapest winners of the left
 //! view that project to it, as in OpenCV's matcher.
 
+use crate::buffer_pool;
 use crate::coarse_prior::PRIOR_CAP;
 use crate::cost::Frame;
 use crate::kernel::penalties;
@@ -13,7 +14,6 @@ use crate::winner::{NO_SUM, Winner, is_flat, outside_cost};
 use cv_core::{Cancelled, Stage};
 use fearless_simd::{Level, dispatch, prelude::*, u8x32, u16x16};
 use fearless_simd_macros::simd;
-use rayon::prelude::*;
 use std::ops::Range;
 
 /// Rows of a strip, and rows outside of it at which its sweeps start.
@@ -34,12 +34,13 @@ pub(crate) fn aggregate(
     frame: &Frame<'_>,
     windows: &SearchWindows,
     eight: bool,
+    buffers: &mut Vec<Buffers>,
     (winners, right): (&mut [Winner], &mut [u16]),
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
     let rows = STRIP * frame.width;
-    let strips = winners.par_chunks_mut(rows).zip(right.par_chunks_mut(rows)).enumerate();
-    strips.try_for_each_init(Buffers::default, |buffers, (strip, output)| {
+    let strips = winners.chunks_mut(rows).zip(right.chunks_mut(rows)).enumerate();
+    buffer_pool::try_for_each(buffers, strips, |buffers, (strip, output)| {
         let strip = Strip { frame, windows, first: strip * STRIP };
         if eight {
             dispatch!(level, simd => match_strip::<_, true>(simd, &strip, buffers, output, stage))
@@ -51,7 +52,7 @@ pub(crate) fn aggregate(
 
 /// Buffers of a strip, reused for the next one.
 #[derive(Debug, Default)]
-struct Buffers {
+pub(crate) struct Buffers {
     /// Sums of the sweep down, [`WINDOW`] of each pixel of the strip.
     sums: Vec<u8>,
     state: State,
@@ -312,6 +313,9 @@ fn compute_costs<S: Simd, const BITS: usize>(simd: S, row: &Row<'_>, xs: Range<u
     let right = &frame.right[row.y * planes * phase..][..planes * phase];
     let left: [&[u8]; 9] = std::array::from_fn(|p| left.get(p * width..(p + 1) * width).unwrap_or(&[]));
     let right: [&[u8]; 9] = std::array::from_fn(|p| right.get(p * phase..(p + 1) * phase).unwrap_or(&[]));
+    // Pixels whose whole range is inside the right image.
+    let start = (frame.disparities as i64 - 1 + frame.min_disparity).max(0) as usize;
+    let interior = start..(width as i64 + frame.min_disparity).clamp(0, width as i64) as usize;
     let priors = frame.priors.get(row.y * width..(row.y + 1) * width);
     for (x, out) in xs.zip(out.chunks_exact_mut(WINDOW)) {
         let first = row.first(false, x);
@@ -327,11 +331,14 @@ fn compute_costs<S: Simd, const BITS: usize>(simd: S, row: &Row<'_>, xs: Range<u
             cost += (value.max(other) - value.min(other)).min(u8x32::splat(simd, cap));
         }
         if let Some(prior) = priors.map(|priors| priors[x]) {
-            let local = (i32::from(prior.index) - first).clamp(-40, 72);
+            let local = (i32::from(prior.index()) - first).clamp(-40, 72);
             let from = (PRIOR_CENTER as i32 - local) as usize;
-            cost += u8x32::from_slice(simd, &PRIOR_COSTS[usize::from(prior.cap.min(PRIOR_CAP))][from..][..WINDOW]);
+            cost += u8x32::from_slice(simd, &PRIOR_COSTS[usize::from(prior.cap())][from..][..WINDOW]);
         }
         cost.store_slice(out);
+        if interior.contains(&x) {
+            continue;
+        }
         let inside = frame.inside(x);
         let first = first as usize;
         if inside.start > first || inside.end < first + WINDOW {
