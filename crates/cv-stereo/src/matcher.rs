@@ -281,8 +281,8 @@ impl StereoMatcher {
             ..self.options.clone()
         };
         let options = if is_hierarchical {
-            let smoothing = StereoOptions::default().smoothing;
-            StereoOptions { search: Search::Hierarchical, fill: true, smoothing, max_memory: None, ..options }
+            let (search, smoothing) = (Search::Hierarchical, Smoothing::None);
+            StereoOptions { search, fill: true, smoothing, max_memory: None, ..options }
         } else {
             StereoOptions {
                 search: Search::Full,
@@ -321,7 +321,7 @@ impl StereoMatcher {
         matcher.compute_gray(map, StageClock::new(), progress)?;
         let range = (self.options.min_disparity, self.options.disparities);
         if is_hierarchical {
-            self.windows.set(map.disparity.as_slice(), width / 2, range);
+            self.windows.set(self.level, map.disparity.as_slice(), width / 2, range);
             let unmatched = map.disparity.as_mut_slice().iter_mut().zip(map.state.as_slice());
             unmatched.filter(|(_, state)| **state != PixelState::Matched).for_each(|(d, _)| *d = f32::NAN);
         }
@@ -371,7 +371,7 @@ impl StereoMatcher {
             right.resize(width * height, 0);
             let frame = frame(0..height);
             let (windows, buffers) = (&self.windows, &mut self.window_sweeps);
-            return window_sweep::aggregate(self.level, &frame, windows, eight, buffers, (winners, right), &stage);
+            return window_sweep::aggregate(self.level, &frame, windows, buffers, (winners, right), &stage);
         }
         let run = |aggregator: &mut Aggregator, rows: Range<usize>| -> Result<(), Cancelled> {
             aggregator.run(self.level, &frame(rows), eight, &stage)
@@ -424,7 +424,11 @@ impl StereoMatcher {
                 bits: options.census.bits(),
                 layout: self.layout(width, self.gray[0].height),
             };
-            fill(self.level, disparity, states, pair, &mut self.filling, &stage)?;
+            // One buffer for both: neither is used in the other's stage.
+            std::mem::swap(&mut self.filling.right, &mut self.scratch);
+            let filled = fill(self.level, disparity, states, pair, &mut self.filling, &stage);
+            std::mem::swap(&mut self.filling.right, &mut self.scratch);
+            filled?;
             stage.add(1)?;
         }
         if options.median > 0 {

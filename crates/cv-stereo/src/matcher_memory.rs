@@ -43,10 +43,10 @@ impl StereoMatcher {
         let layout = self.layout(width, height);
         let stride = layout.right_row(width);
         let aggregation = if self.is_hierarchical(width, height) {
-            // Winners of both views, windows and extremes of coarse pixels.
+            // Winners of both views, and windows of coarse pixels.
             let winners = pixels.saturating_mul(size_of::<Winner>() + size_of::<u16>());
             let strips = window_sweep::bytes(width, height, rayon::current_num_threads());
-            winners.saturating_add(strips).saturating_add(pixels / 4 * 10)
+            winners.saturating_add(strips).saturating_add(pixels / 2)
         } else {
             Aggregator::bytes(width, strip.max(whole), layout)
         };
