@@ -500,6 +500,48 @@ mod tests {
     }
 
     #[test]
+    fn hierarchical_search_finds_large_steps_with_the_same_bytes_on_every_machine() {
+        // Two surfaces, 80 px apart, with a boundary between; the nearer one is slanted.
+        let (width, height) = (720, 400);
+        let hash =
+            |x: usize, y: usize| ((x * 7919 + y * 104_729) as u32).wrapping_mul(2_654_435_761).rotate_left(9) % 97;
+        // Texture of two scales: coarse levels have none of the finer one.
+        let texture = |x: usize, y: usize| (hash(x / 3, y / 3) + hash(x / 11 + 700, y / 11)) as u8;
+        let near = |y: usize| 100 + y / 40;
+        let is_near = |x: usize, y: usize| (300..500).contains(&x) && (60..340).contains(&y);
+        let surface = |x: usize, y: usize, is_near: bool| [texture(x + 5000 * usize::from(is_near), y)];
+        let left = GrayU8::from_fn(width, height, |x, y| surface(x, y, is_near(x, y)));
+        let right = GrayU8::from_fn(width, height, |x, y| {
+            let from_near = x + near(y);
+            if is_near(from_near, y) { surface(from_near, y, true) } else { surface(x + 24, y, false) }
+        });
+        let options = StereoOptions { disparities: 128, search: Search::Hierarchical, ..Default::default() };
+        let mut first: Option<Vec<u32>> = None;
+        for level in instruction_sets() {
+            for threads in [1, 3] {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                let mut matcher = StereoMatcher::new(options.clone()).unwrap();
+                matcher.level = level;
+                assert!(matcher.is_hierarchical(width, height));
+                let map = pool.install(|| matcher.compute(left.view(), right.view(), &Silent)).unwrap();
+                let bits: Vec<u32> = map.disparity.as_slice().iter().map(|d| d.to_bits()).collect();
+                let expected = first.get_or_insert_with(|| bits.clone());
+                assert!(bits == *expected, "{level:?}, {threads} threads");
+                let pixels = (0..height).flat_map(|y| (128..width).map(move |x| (x, y)));
+                let bad = pixels.filter(|&(x, y)| {
+                    let truth = if is_near(x, y) { near(y) } else { 24 };
+                    // The boundary, and what the near surface occludes.
+                    let is_visible = !(200..300).contains(&x) && !(490..510).contains(&x);
+                    is_visible && (map.disparity.at(x, y)[0] - truth as f32).abs() > 1.0
+                });
+                let bad = bad.count();
+                // The rim of the matching windows at the horizontal boundaries, of half resolution at most.
+                assert!(bad < 2 * 200 * 6, "{bad}");
+            }
+        }
+    }
+
+    #[test]
     fn an_image_of_one_color_matches_nowhere() {
         let gray = GrayU8::new(60, 40, [77]);
         let mut matcher = StereoMatcher::new(StereoOptions { disparities: 24, ..Default::default() }).unwrap();

@@ -10,15 +10,15 @@ use crate::{
 use cv_core::Progress;
 
 /// Rows by which strips overlap: aggregation paths that start farther away hardly change the sums.
-pub(crate) const STRIP_OVERLAP: usize = 32;
+pub(crate) const STRIP_OVERLAP: usize = 64;
 
 /// Fewest rows of a strip: lower ones would mostly repeat the overlap.
 const MIN_STRIP_ROWS: usize = 32;
 
 impl StereoMatcher {
     /// Returns the bytes that matching images of this size takes, outputs included: about one byte per pixel and disparity for the
-    /// sums, and seventy per pixel, in quality mode a hundred more (gray levels 6, census bits 3 to 8 of each view, winners 12, labels
-    /// up to 8, priors 4, surfaces 7, the planes of the smoothing 16, outputs and scratch 9), and for the pyramid levels an eighth of the
+    /// sums (hierarchical: some megabytes per thread), and fifty per pixel, in quality mode a hundred more (gray levels 5, census bits 3 to 8
+    /// of each view, winners 12, labels up to 8, priors 2, surfaces 7, outputs and scratch 9), and for the pyramid levels an eighth of the
     /// sums and a third of the rest. Under [`StereoOptions::max_memory`](crate::StereoOptions::max_memory) the sums are those of a strip.
     pub fn memory(&self, width: usize, height: usize) -> usize {
         let coarse = self.coarse_memory(width, height);

@@ -95,12 +95,13 @@ cv_core::named!(Paths { Four = "4": "0.85 of the time, slight streaks on slanted
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Search {
-    /// Hierarchical for large images and ranges, full otherwise.
+    /// Hierarchical from 2²⁸ pixels times disparities on, full otherwise.
     Auto,
     /// The whole range.
     Full,
     /// A window of 32 disparities around those of half resolution (tSGM; Rothermel et al., "SURE", 2012), at every pyramid level but the
-    /// smallest: time and memory hardly depend on the number of disparities.
+    /// smallest: time and memory hardly depend on the number of disparities. The range must include the disparities of the nearest
+    /// objects: errors of coarser levels are not corrected by the next. There are four [`Paths`], and no strips under a memory limit.
     Hierarchical,
 }
 
@@ -180,7 +181,7 @@ pub struct StereoOptions {
     /// Coarser pyramid levels, which give priors to pixels of low texture; 0 for none. Default 2. They take a quarter of the time, more for
     /// 64 and fewer disparities, and none in images without low texture.
     pub pyramid_levels: u8,
-    /// Search range of each pixel. Default [`Search::Auto`].
+    /// Disparities that each pixel is compared at. Default [`Search::Auto`].
     pub search: Search,
     /// Aggregation paths. Default eight.
     pub paths: Paths,
@@ -210,7 +211,7 @@ pub struct StereoOptions {
     /// Whether [`crate::StereoMatcher::confidence`] is computed: the second best match takes a tenth of the time. Default false.
     pub confidence: bool,
     /// Maximum number of bytes of the matcher; `None` sets no limit. If the whole image does not fit, costs are aggregated in strips of rows
-    /// that overlap by 32: at most 0.1 % of the pixels then differ by more than half a pixel from the result without the limit. Default
+    /// that overlap by 64: at most 0.1 % of the pixels then differ by more than half a pixel from the result without the limit. Default
     /// `None`. See [`crate::StereoMatcher::memory`].
     pub max_memory: Option<usize>,
 }

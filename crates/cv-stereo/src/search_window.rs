@@ -94,3 +94,42 @@ fn set_row<S: Simd>(
         *out = before;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cv_synth::instruction_sets;
+
+    #[test]
+    fn windows_include_both_sides_of_a_small_step_and_the_own_side_of_a_large_one() {
+        // Steps from 20 to 24 in column 10 and to 60 in column 30 of half resolution; unknown in column 40.
+        let row: Vec<f32> = (0..50)
+            .map(|x| match x {
+                40 => f32::NAN,
+                0..10 => 20.0,
+                10..30 => 24.0,
+                _ => 60.0,
+            })
+            .collect();
+        let coarse = row.repeat(8);
+        for level in instruction_sets() {
+            let mut windows = SearchWindows::default();
+            windows.set(level, &coarse, 50, (-8, 256));
+            for y in 0..16 {
+                for (x, &first) in windows.row(y).iter().enumerate() {
+                    let includes = |d: f32| {
+                        let index = (2.0 * d) as i32 + 8 - i32::from(first);
+                        (MARGIN as i32..WINDOW as i32 - MARGIN as i32).contains(&index)
+                    };
+                    if !row[x].is_nan() {
+                        assert!(includes(row[x]), "{level:?} {x} {first}");
+                    }
+                    if (8..12).contains(&x) {
+                        assert!(includes(20.0) && includes(24.0), "{level:?} {x} {first}");
+                    }
+                    assert!(first as usize % STEP == 0 && usize::from(first) + WINDOW <= 256);
+                }
+            }
+        }
+    }
+}
