@@ -10,7 +10,7 @@ use crate::{
 use cv_core::Progress;
 
 /// Rows by which strips overlap: aggregation paths that start farther away hardly change the sums.
-pub(crate) const STRIP_OVERLAP: usize = 64;
+pub(crate) const STRIP_OVERLAP: usize = 32;
 
 /// Fewest rows of a strip: lower ones would mostly repeat the overlap.
 const MIN_STRIP_ROWS: usize = 32;

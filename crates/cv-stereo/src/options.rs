@@ -211,8 +211,8 @@ pub struct StereoOptions {
     /// Whether [`crate::StereoMatcher::confidence`] is computed: the second best match takes a tenth of the time. Default false.
     pub confidence: bool,
     /// Maximum number of bytes of the matcher; `None` sets no limit. If the whole image does not fit, costs are aggregated in strips of rows
-    /// that overlap by 64: at most 0.1 % of the pixels then differ by more than half a pixel from the result without the limit. Default
-    /// `None`. See [`crate::StereoMatcher::memory`].
+    /// that overlap by 32: about 0.1 % of the pixels then differ by more than half a pixel from the result without the limit, up to 0.5 % with
+    /// the lowest limits, under which the coarser levels are in strips too. Default `None`. See [`crate::StereoMatcher::memory`].
     pub max_memory: Option<usize>,
 }
 
