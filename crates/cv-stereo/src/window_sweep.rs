@@ -353,10 +353,9 @@ fn project(frame: &Frame<'_>, winners: &[Winner], costs: &mut Vec<u16>, right: &
     for (x, winner) in winners.iter().enumerate() {
         let column = x as i64 - frame.min_disparity - i64::from(winner.index);
         let column = usize::try_from(column).ok();
-        if let Some((cost, index)) = column.and_then(|at| costs.get_mut(at).zip(right.get_mut(at))) {
-            if winner.cost < *cost {
-                (*cost, *index) = (winner.cost, winner.index);
-            }
+        let target = column.and_then(|at| costs.get_mut(at).zip(right.get_mut(at)));
+        if let Some((cost, index)) = target.filter(|(cost, _)| winner.cost < **cost) {
+            (*cost, *index) = (winner.cost, winner.index);
         }
     }
 }
