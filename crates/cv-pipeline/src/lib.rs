@@ -108,7 +108,7 @@ pub mod stereo {
     pub use cv_stereo::{
         BAD_THRESHOLDS, Census, DisparityMap, DisparityMatcher, DisparityScores, EvaluateError, GeometryError,
         Intensity, IntensityCost, Paths, PixelState, Rectification, RectifiedView, RectifyError, RectifyOptions,
-        Smoothing, StereoError, StereoGeometry, StereoMatcher, StereoOptions, Subpixel, evaluate_disparity,
+        Search, Smoothing, StereoError, StereoGeometry, StereoMatcher, StereoOptions, Subpixel, evaluate_disparity,
         non_occluded,
     };
 }

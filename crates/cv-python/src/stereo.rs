@@ -37,6 +37,7 @@ fn matching_options(options: &mut Options<'_>, o: &mut StereoOptions) -> PyResul
     options.set("p2_min", &mut o.p2_min)?;
     options.set("p2_gradient", &mut o.p2_gradient)?;
     options.set("pyramid_levels", &mut o.pyramid_levels)?;
+    options.set_named("search", &mut o.search)?;
     options.set_named("paths", &mut o.paths)?;
     options.set("uniqueness", &mut o.uniqueness)?;
     options.set_optional("left_right", &mut o.left_right)?;

@@ -6,6 +6,7 @@
 //! reconstruction from imagery", 2012), which limits the search range of each pixel by the coarser level; here the range stays complete
 //! and only pixels of low texture have a prior, so that thin structures are not lost.
 
+use crate::options::MAX_DISPARITIES;
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
@@ -24,14 +25,29 @@ const MAX_STEP: f32 = 2.0;
 /// Fraction of low-texture pixels above which a coarser level is matched.
 const MIN_LOW_TEXTURE: f64 = 0.1;
 
-/// The prior of a pixel: an expected disparity.
+/// The prior of a pixel: an expected disparity, in 12 bits, and a cap, in two more.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Prior {
-    /// Index from the smallest disparity.
-    pub(crate) index: u16,
-    /// The cost of index `k` is `|k − index| − 1`, clamped from 0 to this; 0 for pixels without a prior. Coarse disparities are accurate to a
-    /// pixel: within it the prior must not affect the minimum, above all its sub-pixel position.
-    pub(crate) cap: u8,
+pub(crate) struct Prior(u16);
+
+const INDEX_BITS: u32 = MAX_DISPARITIES.ilog2();
+
+impl Prior {
+    pub(crate) fn new(index: u16, cap: u8) -> Self {
+        Self(u16::from(cap) << INDEX_BITS | index)
+    }
+
+    /// Returns the index from the smallest disparity.
+    #[inline(always)]
+    pub(crate) fn index(self) -> u16 {
+        self.0 & ((1 << INDEX_BITS) - 1)
+    }
+
+    /// Returns the maximum cost, 0 for pixels without a prior: the cost of index `k` is `|k − index| − 1`, clamped from 0 to this. Coarse
+    /// disparities are accurate to a pixel: within it the prior must not affect the minimum, above all its sub-pixel position.
+    #[inline(always)]
+    pub(crate) fn cap(self) -> u8 {
+        (self.0 >> INDEX_BITS) as u8
+    }
 }
 
 /// Sets the [`Prior::cap`] of each pixel by the texture of `gray`, into `priors` (resized). Returns whether enough pixels have low texture.
@@ -85,7 +101,7 @@ fn classify_row<S: Simd>(
     let mut low_texture = 0;
     for (prior, &sum) in priors.iter_mut().zip(&*step) {
         let cap = MAX_TEXTURE.iter().map(|&limit| u8::from(sum <= limit)).sum();
-        *prior = Prior { index: 0, cap };
+        *prior = Prior::new(0, cap);
         low_texture += usize::from(cap > 0);
     }
     low_texture
@@ -145,8 +161,7 @@ pub(crate) fn set_priors(
                 let columns = indices.iter().chain(indices.last());
                 for (&index, priors) in columns.zip(priors.chunks_mut(2)) {
                     for prior in priors {
-                        let cap = if index == u16::MAX { 0 } else { prior.cap };
-                        *prior = Prior { index, cap };
+                        *prior = if index == u16::MAX { Prior::default() } else { Prior::new(index, prior.cap()) };
                     }
                 }
             }
@@ -166,8 +181,8 @@ mod tests {
         let mut priors = Vec::new();
         assert!(classify_texture(Level::new(), &gray, width, &mut priors));
         assert!(priors.iter().enumerate().all(|(i, p)| match i % width {
-            0..17 => p.cap == PRIOR_CAP,
-            22.. => p.cap == 0,
+            0..17 => p.cap() == PRIOR_CAP,
+            22.. => p.cap() == 0,
             _ => true,
         }));
         // A map that steps from 3 to 9 px in column 5, unmatched in the lower half.
@@ -181,9 +196,9 @@ mod tests {
         set_priors(Level::new(), &coarse, 20, width, (-4, 32), &mut priors);
         let at = |x: usize, y: usize| priors[y * width + x];
         // Twice the coarse disparity, counted from −4.
-        assert_eq!((at(5, 2).index, at(5, 2).cap), (10, PRIOR_CAP));
-        assert_eq!(at(15, 2).index, 22);
-        assert_eq!((at(9, 2).cap, at(10, 2).cap, at(5, 20).cap), (0, 0, 0));
+        assert_eq!((at(5, 2).index(), at(5, 2).cap()), (10, PRIOR_CAP));
+        assert_eq!(at(15, 2).index(), 22);
+        assert_eq!((at(9, 2).cap(), at(10, 2).cap(), at(5, 20).cap()), (0, 0, 0));
     }
 
     #[test]

@@ -43,7 +43,7 @@ impl Frame<'_> {
     /// Returns the indices whose correspondence is inside the right image: its column decreases with the index, so that the first ones may
     /// be right of the image and the last ones left of it.
     #[inline(always)]
-    fn inside(&self, x: usize) -> Range<usize> {
+    pub(crate) fn inside(&self, x: usize) -> Range<usize> {
         let column = x as i64 - self.min_disparity;
         let n = self.disparities as i64;
         (column - (self.width as i64 - 1)).clamp(0, n) as usize..(column + 1).clamp(0, n) as usize
@@ -130,7 +130,7 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
     }
     if let Some(priors) = frame.priors.get(y * width..(y + 1) * width) {
         for (prior, out) in priors[xs.clone()].iter().zip(out.chunks_exact_mut(groups * group)) {
-            if prior.cap > 0 {
+            if prior.cap() > 0 {
                 add_prior::<S, BLOCKS>(simd, *prior, out);
             }
         }
@@ -180,10 +180,10 @@ fn add_prior<S: Simd, const BLOCKS: usize>(simd: S, prior: Prior, out: &mut [u8]
     let group = BLOCKS * BLOCK;
     let n = group / lanes;
     let first = S::u8s::from_fn(simd, |lane| (lane * n) as u8);
-    let (cap, one) = (S::u8s::splat(simd, prior.cap), S::u8s::splat(simd, 1));
+    let (cap, one) = (S::u8s::splat(simd, prior.cap()), S::u8s::splat(simd, 1));
     for (g, out) in out.chunks_exact_mut(group).enumerate() {
         // Groups have at most 128 indices: outside its own group, a prior is only required to be farther than the cap.
-        let local = i32::from(prior.index) - (g * group) as i32;
+        let local = i32::from(prior.index()) - (g * group) as i32;
         let (at, beyond) = (local.clamp(0, 255) as u8, (-local).clamp(0, 127) as u8);
         let (at, beyond) = (S::u8s::splat(simd, at), S::u8s::splat(simd, beyond));
         for v in 0..n {

@@ -226,7 +226,7 @@ fn columns_of<'a, const N: usize>(rows: &'a [Vec<u8>; N], columns: &Range<usize>
 
 /// Computes P2 − P1 of the pixels of row `y` for each path. At a border, where paths start, any value will do.
 #[inline(always)]
-fn penalties<S: Simd, const PATHS: usize>(
+pub(crate) fn penalties<S: Simd, const PATHS: usize>(
     simd: S,
     frame: &Frame<'_>,
     y: usize,

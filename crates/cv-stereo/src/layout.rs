@@ -30,6 +30,11 @@ impl Layout {
         Self { lanes, group: if blocks.is_multiple_of(2) { 2 * BLOCK } else { BLOCK }, depth: blocks * BLOCK }
     }
 
+    /// Returns a layout of this depth whose groups are single vectors: disparities are contiguous.
+    pub(crate) fn contiguous(self) -> Self {
+        Self { lanes: BLOCK, group: BLOCK, ..self }
+    }
+
     /// Returns the vectors per group.
     pub(crate) fn vectors(&self) -> usize {
         self.group / self.lanes

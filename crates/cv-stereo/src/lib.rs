@@ -19,6 +19,7 @@
 //! Disparity is `x_left − x_right` in pixels, `f32`, NaN where unknown.
 
 mod aligned_buffer;
+mod buffer_pool;
 mod census;
 mod coarse_prior;
 mod confidence;
@@ -46,11 +47,13 @@ mod rectify;
 mod rectify_scene;
 #[cfg(test)]
 mod reference;
+mod search_window;
 mod select;
 mod sgm;
 mod speckle;
 mod surface_filling;
 mod surfaces;
+mod window_sweep;
 mod winner;
 mod winner_checks;
 
@@ -61,7 +64,7 @@ pub use error::StereoError;
 pub use evaluate::{BAD_THRESHOLDS, DisparityScores, EvaluateError, evaluate_disparity, non_occluded};
 pub use input::Intensity;
 pub use matcher::StereoMatcher;
-pub use options::{Census, IntensityCost, Paths, Smoothing, StereoOptions, Subpixel};
+pub use options::{Census, IntensityCost, Paths, Search, Smoothing, StereoOptions, Subpixel};
 #[doc(hidden)]
 pub use path_sums::PathSums;
 pub use rectify::{Rectification, RectifiedView, RectifyError, RectifyOptions};

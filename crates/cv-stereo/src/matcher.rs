@@ -5,17 +5,18 @@ use crate::coarse_prior::{Prior, classify_texture, set_priors};
 use crate::confidence::{confidence, sigma};
 use crate::cost::{Frame, Penalties};
 use crate::disparity_map::{DisparityMap, PixelState};
-use crate::edge_preserving::{Planes, smooth};
+use crate::edge_preserving::{SmoothingBuffers, smooth};
 use crate::input::to_gray;
 use crate::layout::Layout;
 use crate::local_expansion;
 use crate::matcher_memory::STRIP_OVERLAP;
+use crate::search_window::SearchWindows;
 use crate::sgm::Aggregator;
 use crate::speckle::{Speckles, remove_speckles};
 use crate::surface_filling::{self, Filling, Pair, fill};
 use crate::winner::Winner;
 use crate::winner_checks::check_row;
-use crate::{Intensity, IntensityCost, Paths, Smoothing, StereoError, StereoOptions, median};
+use crate::{Intensity, IntensityCost, Paths, Search, Smoothing, StereoError, StereoOptions, median, window_sweep};
 use cv_core::{Cancelled, GrayF32, ImageView, Progress, Stage, StageClock};
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
@@ -30,6 +31,11 @@ const MIN_PYRAMID_DISPARITIES: usize = 32;
 /// A coarser level gives priors if this fraction of it is matched. Each of the 24 public pairs has 0.65 or more; images of different
 /// scenes, and exchanged ones, which priors would make consistent with themselves, mostly have less.
 const MIN_PRIOR_MATCHED: f64 = 0.6;
+
+/// Matching is hierarchical by [`Search::Auto`] from this many pixels times disparities on, and by [`Search::Hierarchical`], which is also
+/// that of the coarser levels, from the second.
+const MIN_AUTO_VOLUME: usize = 1 << 28;
+const MIN_HIERARCHICAL_VOLUME: usize = 1 << 25;
 
 /// A semi-global matcher (Hirschmüller, PAMI 2008) that reuses its buffers between pairs.
 ///
@@ -60,10 +66,14 @@ pub struct StereoMatcher {
     speckles: Speckles,
     filling: Filling,
     scratch: Vec<f32>,
-    planes: Planes,
+    smoothing: SmoothingBuffers,
+    /// Buffers of the threads of hierarchical matching.
+    window_sweeps: Vec<window_sweep::Buffers>,
     /// Priors of low-texture pixels; empty without any.
     priors: Vec<Prior>,
-    /// The matcher at half resolution, which the priors are from.
+    /// Search windows of hierarchical matching.
+    windows: SearchWindows,
+    /// The matcher at half resolution, which the priors and windows are from.
     coarse: Option<Box<Coarse>>,
     stages: Vec<(&'static str, f64)>,
 }
@@ -93,8 +103,10 @@ impl StereoMatcher {
             speckles: Speckles::default(),
             filling: Filling::default(),
             scratch: Vec::new(),
-            planes: Planes::default(),
+            smoothing: SmoothingBuffers::default(),
+            window_sweeps: Vec::new(),
             priors: Vec::new(),
+            windows: SearchWindows::default(),
             coarse: None,
             stages: Vec::new(),
         })
@@ -212,20 +224,37 @@ impl StereoMatcher {
         height: usize,
         progress: &dyn Progress,
     ) -> Result<(), Cancelled> {
+        if self.is_hierarchical(width, height) {
+            return Ok(());
+        }
+        let layout = self.layout(width, height);
         match self.strip_rows(width, height, self.coarse_memory(width, height)) {
-            None => self.aggregator.prepare(width, height, self.layout(), progress),
-            Some(rows) => self.strip.prepare(width, (rows + 2 * STRIP_OVERLAP).min(height), self.layout(), progress),
+            None => self.aggregator.prepare(width, height, layout, progress),
+            Some(rows) => self.strip.prepare(width, (rows + 2 * STRIP_OVERLAP).min(height), layout, progress),
         }
     }
 
+    /// Returns whether images of this size are matched in search windows from half resolution.
+    pub(crate) fn is_hierarchical(&self, width: usize, height: usize) -> bool {
+        let StereoOptions { disparities, search, .. } = self.options;
+        let volume = width.saturating_mul(height).saturating_mul(disparities);
+        let is_large = match search {
+            Search::Full => false,
+            Search::Auto => volume >= MIN_AUTO_VOLUME,
+            Search::Hierarchical => volume >= MIN_HIERARCHICAL_VOLUME,
+        };
+        is_large && disparities >= MIN_PYRAMID_DISPARITIES && width.min(height) >= 2 * MIN_PYRAMID_SIDE
+    }
+
     /// Returns the memory layout of the disparities of a pixel.
-    pub(crate) fn layout(&self) -> Layout {
-        Layout::new(self.level, self.options.disparities)
+    pub(crate) fn layout(&self, width: usize, height: usize) -> Layout {
+        let layout = Layout::new(self.level, self.options.disparities);
+        if self.is_hierarchical(width, height) { layout.contiguous() } else { layout }
     }
 
     /// Computes census bits, values of the intensity cost and 8-bit gray levels.
     fn describe_pixels(&mut self) {
-        let (level, layout) = (self.level, self.layout());
+        let (level, layout) = (self.level, self.layout(self.gray[0].width, self.gray[0].height));
         let StereoOptions { census, intensity_cost, min_disparity, .. } = self.options;
         let [left, right] = &mut self.described;
         describe(level, &self.gray[0], census, intensity_cost, left);
@@ -236,7 +265,9 @@ impl StereoMatcher {
     /// Returns a matcher for half resolution and its bytes; `None` without a further level, and where the memory limit excludes it.
     pub(crate) fn coarser(&self, width: usize, height: usize) -> Option<(Self, usize)> {
         let StereoOptions { min_disparity, disparities, pyramid_levels, max_memory, .. } = self.options;
-        if pyramid_levels == 0 || width.min(height) < 2 * MIN_PYRAMID_SIDE || disparities < MIN_PYRAMID_DISPARITIES {
+        let is_hierarchical = self.is_hierarchical(width, height);
+        let is_small = width.min(height) < 2 * MIN_PYRAMID_SIDE || disparities < MIN_PYRAMID_DISPARITIES;
+        if is_small || !is_hierarchical && pyramid_levels == 0 {
             return None;
         }
         let first = min_disparity.div_euclid(2);
@@ -244,15 +275,24 @@ impl StereoMatcher {
         let options = StereoOptions {
             min_disparity: first,
             disparities: (last - first + 1) as usize,
-            pyramid_levels: pyramid_levels - 1,
             speckle_size: self.options.speckle_size / 4,
-            paths: Paths::Four,
             confidence: false,
-            fill: false,
             quality: false,
-            smoothing: Smoothing::None,
-            max_memory: max_memory.map(|bytes| bytes / 4),
             ..self.options.clone()
+        };
+        let options = if is_hierarchical {
+            let (search, smoothing) = (Search::Hierarchical, Smoothing::None);
+            StereoOptions { search, fill: true, smoothing, max_memory: None, ..options }
+        } else {
+            StereoOptions {
+                search: Search::Full,
+                pyramid_levels: pyramid_levels - 1,
+                paths: Paths::Four,
+                fill: false,
+                smoothing: Smoothing::None,
+                max_memory: max_memory.map(|bytes| bytes / 4),
+                ..options
+            }
         };
         let mut coarse = Self::new(options).ok()?;
         coarse.level = self.level;
@@ -262,12 +302,15 @@ impl StereoMatcher {
 
     /// Matches at half resolution if enough of the image has low texture, and sets `priors`.
     fn match_coarse(&mut self, width: usize, height: usize, progress: &dyn Progress) -> Result<(), StereoError> {
+        let is_hierarchical = self.is_hierarchical(width, height);
         let coarse = self.coarser(width, height);
-        let Some((new, _)) = coarse.filter(|_| classify_texture(self.level, &self.gray8, width, &mut self.priors))
-        else {
+        let has_priors = coarse.is_some()
+            && self.options.pyramid_levels > 0
+            && classify_texture(self.level, &self.gray8, width, &mut self.priors);
+        if !has_priors {
             self.priors.clear();
-            return Ok(());
-        };
+        }
+        let Some((new, _)) = coarse.filter(|_| is_hierarchical || has_priors) else { return Ok(()) };
         // Replaced if the image size gives it other options.
         let coarse = self.coarse.take().filter(|coarse| coarse.matcher.options == new.options);
         let mut coarse = coarse.unwrap_or_else(|| Box::new(Coarse { matcher: new, map: DisparityMap::empty() }));
@@ -276,20 +319,26 @@ impl StereoMatcher {
             small.halve(large);
         }
         matcher.compute_gray(map, StageClock::new(), progress)?;
+        let range = (self.options.min_disparity, self.options.disparities);
+        if is_hierarchical {
+            self.windows.set(self.level, map.disparity.as_slice(), width / 2, range);
+            let unmatched = map.disparity.as_mut_slice().iter_mut().zip(map.state.as_slice());
+            unmatched.filter(|(_, state)| **state != PixelState::Matched).for_each(|(d, _)| *d = f32::NAN);
+        }
         if map.matched_fraction() < MIN_PRIOR_MATCHED {
             self.priors.clear();
-        } else {
-            let range = (self.options.min_disparity, self.options.disparities);
+        } else if has_priors {
             set_priors(self.level, map.disparity.as_slice(), width / 2, width, range, &mut self.priors);
         }
-        self.coarse = Some(coarse);
+        // Freed where images are large: its memory serves the buffers of this level.
+        self.coarse = (!is_hierarchical).then_some(coarse);
         Ok(())
     }
 
     /// Aggregates the costs and selects the winners of both views.
     fn aggregate(&mut self, width: usize, height: usize, progress: &dyn Progress) -> Result<(), Cancelled> {
         let options = &self.options;
-        let layout = self.layout();
+        let layout = self.layout(width, height);
         let planes = planes(options.census, options.intensity_cost);
         let stride = planes * layout.right_row(width);
         let p2 = Penalties::new(options);
@@ -297,25 +346,35 @@ impl StereoMatcher {
         let strips = rows.map_or(1, |rows| height.div_ceil(rows));
         // Each row twice, and the overlap of strips.
         let stage = Stage::new(progress, "aggregate", 2 * (height + 2 * STRIP_OVERLAP * (strips - 1)))?;
+        let frame = |rows: Range<usize>| Frame {
+            width,
+            height: rows.len(),
+            min_disparity: i64::from(options.min_disparity),
+            disparities: options.disparities,
+            layout,
+            planes,
+            left: &self.described[0][rows.start * width * planes..rows.end * width * planes],
+            right: &self.described[1][rows.start * stride..rows.end * stride],
+            given: None,
+            priors: self.priors.get(rows.start * width..rows.end * width).unwrap_or(&[]),
+            intensity_cap: (options.intensity_cost != IntensityCost::None).then(|| options.intensity_cost.cap()),
+            gray: &self.gray8[rows.start * width..rows.end * width],
+            p1: options.p1,
+            p2: &p2,
+            second: options.confidence || options.uniqueness > 0,
+        };
+        let eight = options.paths == Paths::Eight;
+        let is_hierarchical = self.is_hierarchical(width, height);
+        let Aggregator { winners, right, .. } = &mut self.aggregator;
+        if is_hierarchical {
+            winners.resize(width * height, Winner::default());
+            right.resize(width * height, 0);
+            let frame = frame(0..height);
+            let (windows, buffers) = (&self.windows, &mut self.window_sweeps);
+            return window_sweep::aggregate(self.level, &frame, windows, buffers, (winners, right), &stage);
+        }
         let run = |aggregator: &mut Aggregator, rows: Range<usize>| -> Result<(), Cancelled> {
-            let frame = Frame {
-                width,
-                height: rows.len(),
-                min_disparity: i64::from(options.min_disparity),
-                disparities: options.disparities,
-                layout,
-                planes,
-                left: &self.described[0][rows.start * width * planes..rows.end * width * planes],
-                right: &self.described[1][rows.start * stride..rows.end * stride],
-                given: None,
-                priors: self.priors.get(rows.start * width..rows.end * width).unwrap_or(&[]),
-                intensity_cap: (options.intensity_cost != IntensityCost::None).then(|| options.intensity_cost.cap()),
-                gray: &self.gray8[rows.start * width..rows.end * width],
-                p1: options.p1,
-                p2: &p2,
-                second: options.confidence || options.uniqueness > 0,
-            };
-            aggregator.run(self.level, &frame, options.paths == Paths::Eight, &stage)
+            aggregator.run(self.level, &frame(rows), eight, &stage)
         };
         let Some(rows) = rows else { return run(&mut self.aggregator, 0..height) };
         let Aggregator { winners, right, .. } = &mut self.aggregator;
@@ -363,20 +422,24 @@ impl StereoMatcher {
                 described: [&self.described[0], &self.described[1]],
                 planes: planes(options.census, options.intensity_cost),
                 bits: options.census.bits(),
-                layout: Layout::new(self.level, options.disparities),
+                layout: self.layout(width, self.gray[0].height),
             };
-            fill(self.level, disparity, states, pair, &mut self.filling, &stage)?;
+            // One buffer for both: neither is used in the other's stage.
+            std::mem::swap(&mut self.filling.right, &mut self.scratch);
+            let filled = fill(self.level, disparity, states, pair, &mut self.filling, &stage);
+            std::mem::swap(&mut self.filling.right, &mut self.scratch);
+            filled?;
             stage.add(1)?;
         }
         if options.median > 0 {
             median::median(self.level, disparity, width, options.median, &mut self.scratch);
-            disparity
-                .par_chunks_mut(1 << 16)
-                .zip(self.scratch.par_chunks(1 << 16))
-                .for_each(|(d, s)| d.copy_from_slice(s));
             stage.add(1)?;
+        } else {
+            self.scratch.clear();
+            self.scratch.extend_from_slice(disparity);
         }
-        smooth(self.level, options.smoothing, disparity, states, &self.gray8, width, &mut self.planes, &stage)?;
+        let (source, gray, buffers) = (&self.scratch, &self.gray8, &mut self.smoothing);
+        smooth(self.level, options.smoothing, source, disparity, states, gray, width, buffers, &stage)?;
         stage.add(1)?;
         // Without any match there is nothing to improve.
         if options.quality && disparity.iter().all(|d| d.is_finite()) {
@@ -432,6 +495,48 @@ mod tests {
                     let expected = first.get_or_insert_with(|| found.clone());
                     assert!(found == *expected, "{level:?}, {threads} threads, {smoothing:?}");
                 }
+            }
+        }
+    }
+
+    #[test]
+    fn hierarchical_search_finds_large_steps_with_the_same_bytes_on_every_machine() {
+        // Two surfaces, 80 px apart, with a boundary between; the nearer one is slanted.
+        let (width, height) = (720, 400);
+        let hash =
+            |x: usize, y: usize| ((x * 7919 + y * 104_729) as u32).wrapping_mul(2_654_435_761).rotate_left(9) % 97;
+        // Texture of two scales: coarse levels have none of the finer one.
+        let texture = |x: usize, y: usize| (hash(x / 3, y / 3) + hash(x / 11 + 700, y / 11)) as u8;
+        let near = |y: usize| 100 + y / 40;
+        let is_near = |x: usize, y: usize| (300..500).contains(&x) && (60..340).contains(&y);
+        let surface = |x: usize, y: usize, is_near: bool| [texture(x + 5000 * usize::from(is_near), y)];
+        let left = GrayU8::from_fn(width, height, |x, y| surface(x, y, is_near(x, y)));
+        let right = GrayU8::from_fn(width, height, |x, y| {
+            let from_near = x + near(y);
+            if is_near(from_near, y) { surface(from_near, y, true) } else { surface(x + 24, y, false) }
+        });
+        let options = StereoOptions { disparities: 128, search: Search::Hierarchical, ..Default::default() };
+        let mut first: Option<Vec<u32>> = None;
+        for level in instruction_sets() {
+            for threads in [1, 3] {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                let mut matcher = StereoMatcher::new(options.clone()).unwrap();
+                matcher.level = level;
+                assert!(matcher.is_hierarchical(width, height));
+                let map = pool.install(|| matcher.compute(left.view(), right.view(), &Silent)).unwrap();
+                let bits: Vec<u32> = map.disparity.as_slice().iter().map(|d| d.to_bits()).collect();
+                let expected = first.get_or_insert_with(|| bits.clone());
+                assert!(bits == *expected, "{level:?}, {threads} threads");
+                let pixels = (0..height).flat_map(|y| (128..width).map(move |x| (x, y)));
+                let bad = pixels.filter(|&(x, y)| {
+                    let truth = if is_near(x, y) { near(y) } else { 24 };
+                    // The boundary, and what the near surface occludes.
+                    let is_visible = !(200..300).contains(&x) && !(490..510).contains(&x);
+                    is_visible && (map.disparity.at(x, y)[0] - truth as f32).abs() > 1.0
+                });
+                let bad = bad.count();
+                // The rim of the matching windows at the horizontal boundaries, of half resolution at most.
+                assert!(bad < 2 * 200 * 6, "{bad}");
             }
         }
     }

@@ -4,7 +4,9 @@ use crate::census::planes;
 use crate::coarse_prior::Prior;
 use crate::sgm::Aggregator;
 use crate::winner::Winner;
-use crate::{DisparityMap, StereoError, StereoMatcher, edge_preserving, local_expansion, surface_filling};
+use crate::{
+    DisparityMap, StereoError, StereoMatcher, edge_preserving, local_expansion, surface_filling, window_sweep,
+};
 use cv_core::Progress;
 
 /// Rows by which strips overlap: aggregation paths that start farther away hardly change the sums.
@@ -15,8 +17,8 @@ const MIN_STRIP_ROWS: usize = 32;
 
 impl StereoMatcher {
     /// Returns the bytes that matching images of this size takes, outputs included: about one byte per pixel and disparity for the
-    /// sums, and seventy per pixel, in quality mode a hundred more (gray levels 6, census bits 3 to 8 of each view, winners 12, labels
-    /// up to 8, priors 4, surfaces 7, the planes of the smoothing 16, outputs and scratch 9), and for the pyramid levels an eighth of the
+    /// sums (hierarchical: some megabytes per thread), and fifty per pixel, in quality mode a hundred more (gray levels 5, census bits 3 to 8
+    /// of each view, winners 12, labels up to 8, priors 2, surfaces 7, outputs and scratch 9), and for the pyramid levels an eighth of the
     /// sums and a third of the rest. Under [`StereoOptions::max_memory`](crate::StereoOptions::max_memory) the sums are those of a strip.
     pub fn memory(&self, width: usize, height: usize) -> usize {
         let coarse = self.coarse_memory(width, height);
@@ -38,8 +40,17 @@ impl StereoMatcher {
         let whole = if rows < height { 0 } else { height };
         // Gray of both views in 16 bits, of one in 8; winners of both views; labels, scratch and outputs.
         let fixed = 5 + planes + size_of::<Winner>() + size_of::<u16>() + 8 + 4 + 5 + size_of::<Prior>();
-        let stride = self.layout().right_row(width);
-        Aggregator::bytes(width, strip.max(whole), self.layout())
+        let layout = self.layout(width, height);
+        let stride = layout.right_row(width);
+        let aggregation = if self.is_hierarchical(width, height) {
+            // Winners of both views, and windows of coarse pixels.
+            let winners = pixels.saturating_mul(size_of::<Winner>() + size_of::<u16>());
+            let strips = window_sweep::bytes(width, height, rayon::current_num_threads());
+            winners.saturating_add(strips).saturating_add(pixels / 2)
+        } else {
+            Aggregator::bytes(width, strip.max(whole), layout)
+        };
+        aggregation
             .saturating_add(strip.saturating_mul(width).saturating_mul(size_of::<Winner>() + size_of::<u16>()))
             .saturating_add(pixels.saturating_mul(fixed))
             .saturating_add(edge_preserving::bytes(options.smoothing, width, height))
@@ -52,7 +63,7 @@ impl StereoMatcher {
     /// Returns how many rows at a time are aggregated under the memory limit; `None` for all, and where even the lowest strips
     /// exceed it.
     pub(crate) fn strip_rows(&self, width: usize, height: usize, coarse: usize) -> Option<usize> {
-        let allowed = self.options().max_memory?;
+        let allowed = self.options().max_memory.filter(|_| !self.is_hierarchical(width, height))?;
         if self.memory_of(width, height, height, coarse) <= allowed {
             return None;
         }

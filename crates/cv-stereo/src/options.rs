@@ -90,6 +90,27 @@ pub enum Paths {
 
 cv_core::named!(Paths { Four = "4": "0.85 of the time, slight streaks on slanted surfaces", Eight = "8" });
 
+/// Which disparities of the range each pixel is compared at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+#[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
+pub enum Search {
+    /// Hierarchical from 2²⁸ pixels times disparities on, full otherwise.
+    Auto,
+    /// The whole range.
+    Full,
+    /// A window of 32 disparities around those of half resolution (tSGM; Rothermel et al., "SURE", 2012), at every pyramid level but the
+    /// smallest: time and memory hardly depend on the number of disparities. The range must include the disparities of the nearest
+    /// objects: errors of coarser levels are not corrected by the next. There are four [`Paths`], and no strips under a memory limit.
+    Hierarchical,
+}
+
+cv_core::named!(Search {
+    Auto = "auto": "hierarchical for large images and ranges, full otherwise",
+    Full = "full": "the whole range",
+    Hierarchical = "hierarchical": "a window of 32 disparities around those of half resolution",
+});
+
 /// Sub-pixel refinement of the disparity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
@@ -160,6 +181,8 @@ pub struct StereoOptions {
     /// Coarser pyramid levels, which give priors to pixels of low texture; 0 for none. Default 2. They take a quarter of the time, more for
     /// 64 and fewer disparities, and none in images without low texture.
     pub pyramid_levels: u8,
+    /// Disparities that each pixel is compared at. Default [`Search::Auto`].
+    pub search: Search,
     /// Aggregation paths. Default eight.
     pub paths: Paths,
     /// Uniqueness ratio: percent by which a winner must be cheaper than any disparity not next to it; 0 to 99, 0 accepts all. Default 0: the
@@ -188,8 +211,8 @@ pub struct StereoOptions {
     /// Whether [`crate::StereoMatcher::confidence`] is computed: the second best match takes a tenth of the time. Default false.
     pub confidence: bool,
     /// Maximum number of bytes of the matcher; `None` sets no limit. If the whole image does not fit, costs are aggregated in strips of rows
-    /// that overlap by 32: at most 0.1 % of the pixels then differ by more than half a pixel from the result without the limit. Default
-    /// `None`. See [`crate::StereoMatcher::memory`].
+    /// that overlap by 32: about 0.1 % of the pixels then differ by more than half a pixel from the result without the limit, up to 0.5 % with
+    /// the lowest limits, under which the coarser levels are in strips too. Default `None`. See [`crate::StereoMatcher::memory`].
     pub max_memory: Option<usize>,
 }
 
@@ -205,6 +228,7 @@ impl Default for StereoOptions {
             p2_min: 4,
             p2_gradient: 8,
             pyramid_levels: 2,
+            search: Search::Auto,
             paths: Paths::Eight,
             uniqueness: 0,
             left_right: Some(1),

@@ -28,8 +28,9 @@ pub(crate) fn match_reference(
         (left[i] ^ right[j]).count_ones() as u8 + more.min(options.intensity_cost.cap())
     };
     let prior_cost = |i: usize, k: usize| {
-        let cost =
-            |prior: &Prior| usize::from(prior.index).abs_diff(k).saturating_sub(1).min(usize::from(prior.cap)) as u8;
+        let cost = |prior: &Prior| {
+            usize::from(prior.index()).abs_diff(k).saturating_sub(1).min(usize::from(prior.cap())) as u8
+        };
         priors.get(i).map_or(0, cost)
     };
     let costs: Vec<u8> = (0..width * height)
@@ -124,8 +125,9 @@ mod tests {
     use crate::census::{Gray, MARGIN, describe, describe_mirrored, planes};
     use crate::cost::{Frame, Penalties};
     use crate::layout::Layout;
+    use crate::search_window::{SearchWindows, WINDOW};
     use crate::sgm::Aggregator;
-    use crate::{Census, StereoOptions};
+    use crate::{Census, StereoOptions, window_sweep};
     use cv_synth::instruction_sets;
     use proptest::prelude::*;
 
@@ -231,7 +233,7 @@ mod tests {
             let right: Vec<u16> = (0..width * height).map(|i| noise(if i % 5 == 0 { i + 7 } else { i + 3 })).collect();
             let bits = [&left, &right].map(|g| census_reference(g, width, height, options.census));
             let blended = [&left, &right].map(|g| intensity_reference(g, width, options.intensity_cost));
-            let prior = |i: usize| Prior { index: (noise(i + 11) as usize * 31 % disparities) as u16, cap: (noise(i + 5) % 4) as u8 };
+            let prior = |i: usize| Prior::new((noise(i + 11) as usize * 31 % disparities) as u16, (noise(i + 5) % 4) as u8);
             let priors: Vec<Prior> = if has_priors { (0..width * height).map(prior).collect() } else { Vec::new() };
             let expected = match_reference(&options, &left, [&bits[0], &bits[1]], &blended, &priors, width, height);
 
@@ -260,6 +262,50 @@ mod tests {
                     prop_assert_eq!(&aggregator.winners, &expected.0, "{:?}", level);
                     prop_assert_eq!(&aggregator.right, &expected.1, "{:?}", level);
                 }
+            }
+        }
+
+        #[test]
+        fn a_window_of_the_whole_range_has_the_winners_of_the_reference(
+            options in options(),
+            width in 9usize..90,
+            height in 7usize..16,
+            seed in any::<u64>(),
+        ) {
+            let options = StereoOptions { disparities: WINDOW, paths: Paths::Four, ..options };
+            let StereoOptions { census, intensity_cost, disparities, .. } = options;
+            let noise = |i: usize| ((seed.wrapping_add(i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40) as u16 % 5) * 13_107;
+            let left: Vec<u16> = (0..width * height).map(noise).collect();
+            let right: Vec<u16> = (0..width * height).map(|i| noise(i + 3)).collect();
+            let bits = [&left, &right].map(|g| census_reference(g, width, height, options.census));
+            let blended = [&left, &right].map(|g| intensity_reference(g, width, options.intensity_cost));
+            let priors: Vec<Prior> = (0..width * height).map(|i| Prior::new(noise(i + 11) % 32, (noise(i + 5) % 4) as u8)).collect();
+            let expected = match_reference(&options, &left, [&bits[0], &bits[1]], &blended, &priors, width, height);
+            let gray = [padded(&left, width, height), padded(&right, width, height)];
+            let min_disparity = i64::from(options.min_disparity);
+            let p2 = Penalties::new(&options);
+            let mut windows = SearchWindows::default();
+            for level in instruction_sets() {
+                let layout = Layout::new(level, disparities).contiguous();
+                let (mut a, mut b, mut bytes) = (Vec::new(), Vec::new(), Vec::new());
+                describe(level, &gray[0], census, intensity_cost, &mut a);
+                describe_mirrored(level, &gray[1], census, intensity_cost, min_disparity, layout, &mut b);
+                gray[0].to_bytes(&mut bytes);
+                let frame = Frame {
+                    width, height, min_disparity, disparities, layout, planes: planes(census, intensity_cost),
+                    left: &a, right: &b, gray: &bytes,
+                    given: None,
+                    priors: &priors,
+                    intensity_cap: (intensity_cost != IntensityCost::None).then_some(intensity_cost.cap()),
+                    p1: options.p1, p2: &p2, second: options.confidence,
+                };
+                windows.set(level, &vec![5.0; (width / 2) * (height / 2)], width / 2, (options.min_disparity, disparities));
+                let mut winners = vec![Winner::default(); width * height];
+                let mut right = vec![0; width * height];
+                let stage = cv_core::Stage::new(&cv_core::Silent, "", 0).unwrap();
+                let output = (&mut winners[..], &mut right[..]);
+                window_sweep::aggregate(level, &frame, &windows, &mut Vec::new(), output, &stage).unwrap();
+                prop_assert_eq!(&winners, &expected.0, "{:?}", level);
             }
         }
     }

@@ -72,7 +72,7 @@ pub(crate) struct Pair<'a> {
 pub(crate) struct Filling {
     surfaces: Surfaces,
     /// Disparity of the nearest match of each pixel of the right image, −∞ without any.
-    right: Vec<f32>,
+    pub(crate) right: Vec<f32>,
     /// Cells without an initial surface.
     open: Vec<u32>,
     heap: BinaryHeap<Reverse<(u64, u32, u32)>>,

@@ -19,7 +19,7 @@ mod tests {
     use cv_pipeline::features::{CornerMeasure, Suppression};
     use cv_pipeline::panorama_types::{BlendMode, Exposure, Projection, Seams};
     use cv_pipeline::segmentation::{ColorSpace, Regions, Rule};
-    use cv_pipeline::stereo::{Census, IntensityCost, Paths, Smoothing};
+    use cv_pipeline::stereo::{Census, IntensityCost, Paths, Search, Smoothing};
     use cv_pipeline::{AffineSimulation, Axes, FeatureMethod, ModelKind};
 
     /// Checks that every name and alias is parsed to its value.
@@ -49,6 +49,7 @@ mod tests {
         round_trips::<Regions>();
         round_trips::<Census>();
         round_trips::<Paths>();
+        round_trips::<Search>();
         round_trips::<IntensityCost>();
         round_trips::<Smoothing>();
         round_trips::<Projection>();

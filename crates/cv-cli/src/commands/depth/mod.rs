@@ -15,8 +15,8 @@ use crate::{rig, words};
 use cv_core::ImageView;
 use cv_io::ply::PlyEncoding;
 use cv_pipeline::stereo::{
-    Census, DisparityMap, IntensityCost, Paths, PixelState, Rectification, RectifyOptions, Smoothing, StereoGeometry,
-    StereoMatcher, StereoOptions,
+    Census, DisparityMap, IntensityCost, Paths, PixelState, Rectification, RectifyOptions, Search, Smoothing,
+    StereoGeometry, StereoMatcher, StereoOptions,
 };
 use cv_pipeline::{DepthError, DepthOptions, DepthResult, FrameDepth, RigDepthResult, VerticalOffset};
 use maps::write_map;
@@ -95,6 +95,9 @@ pub(crate) struct Args {
     /// Farthest depth to keep [default: all].
     #[arg(long, value_name = "Z")]
     far: Option<f32>,
+    /// Disparities that each pixel is compared at. `auto` is hierarchical from 2^28 pixels times disparities on (6 megapixels at 45).
+    #[arg(long, value_name = "HOW", value_parser = named::<Search>(), default_value_t = StereoOptions::default().search)]
+    search: Search,
     /// Directions of cost aggregation.
     #[arg(long, value_name = "N", value_parser = named::<Paths>(), default_value_t = StereoOptions::default().paths)]
     paths: Paths,

@@ -31,6 +31,7 @@ impl Args {
                 },
                 census: self.census,
                 pyramid_levels: self.pyramid_levels,
+                search: self.search,
                 paths: self.paths,
                 uniqueness: self.uniqueness,
                 speckle_size: self.speckle_size,
