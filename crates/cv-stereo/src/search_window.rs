@@ -127,7 +127,7 @@ mod tests {
                     if (8..12).contains(&x) {
                         assert!(includes(20.0) && includes(24.0), "{level:?} {x} {first}");
                     }
-                    assert!(first as usize % STEP == 0 && usize::from(first) + WINDOW <= 256);
+                    assert!((first as usize).is_multiple_of(STEP) && usize::from(first) + WINDOW <= 256);
                 }
             }
         }
