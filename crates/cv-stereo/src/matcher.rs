@@ -240,7 +240,7 @@ impl StereoMatcher {
         let volume = width.saturating_mul(height).saturating_mul(disparities);
         let is_large = match search {
             Search::Full => false,
-            Search::Auto => volume >= MIN_AUTO_VOLUME,
+            Search::Auto => volume >= MIN_AUTO_VOLUME && self.hierarchy_fits(width, height),
             Search::Hierarchical => volume >= MIN_HIERARCHICAL_VOLUME,
         };
         is_large && disparities >= MIN_PYRAMID_DISPARITIES && width.min(height) >= 2 * MIN_PYRAMID_SIDE

@@ -5,7 +5,8 @@ use crate::coarse_prior::Prior;
 use crate::sgm::Aggregator;
 use crate::winner::Winner;
 use crate::{
-    DisparityMap, StereoError, StereoMatcher, edge_preserving, local_expansion, surface_filling, window_sweep,
+    DisparityMap, Search, StereoError, StereoMatcher, StereoOptions, edge_preserving, local_expansion, surface_filling,
+    window_sweep,
 };
 use cv_core::Progress;
 
@@ -70,6 +71,13 @@ impl StereoMatcher {
         // The more rows, the fewer are computed twice.
         let fits = |rows: &usize| self.memory_of(width, height, *rows, coarse) <= allowed;
         (MIN_STRIP_ROWS..height).step_by(MIN_STRIP_ROWS).take_while(fits).last()
+    }
+
+    /// Returns whether hierarchical matching is within the memory limit. Strips of the whole range may be where it is not.
+    pub(crate) fn hierarchy_fits(&self, width: usize, height: usize) -> bool {
+        let Some(allowed) = self.options().max_memory else { return true };
+        let options = StereoOptions { search: Search::Hierarchical, max_memory: None, ..self.options().clone() };
+        Self::new(options).is_ok_and(|matcher| matcher.memory(width, height) <= allowed)
     }
 
     /// Refuses image sizes that are not possible with these options.

@@ -95,7 +95,7 @@ cv_core::named!(Paths { Four = "4": "0.85 of the time, slight streaks on slanted
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(rename_all = "kebab-case"))]
 pub enum Search {
-    /// Hierarchical from 2²⁸ pixels times disparities on, full otherwise.
+    /// Hierarchical from 2²⁸ pixels times disparities on, if the memory limit allows; full otherwise.
     Auto,
     /// The whole range.
     Full,

@@ -260,6 +260,16 @@ mod tests {
             .fold(0.0, f64::max)
     }
 
+    /// Maximum singular value of the Jacobian of the map at the corners of 640 × 480.
+    fn largest_magnification(h: &Matrix3<f64>) -> f64 {
+        let at = |(x, y): (f64, f64)| {
+            let ((u, v), (ux, vx), (uy, vy)) = (map(h, x, y), map(h, x + 1e-3, y), map(h, x, y + 1e-3));
+            let jacobian = nalgebra::Matrix2::new(ux - u, uy - u, vx - v, vy - v) * 1e3;
+            jacobian.singular_values().max()
+        };
+        [(0.0, 0.0), (639.0, 0.0), (0.0, 479.0), (639.0, 479.0)].map(at).into_iter().fold(0.0, f64::max)
+    }
+
     proptest! {
         #[test]
         fn every_entry_is_recovered_from_exact_points(h in a_homography(), n in 4usize..20, seed: u64) {
@@ -291,9 +301,11 @@ mod tests {
             }
             let found = estimate_homography(&m, &RobustOptions { seed, ..RobustOptions::homography() }, &Silent).unwrap();
             prop_assert_eq!(found.model[(2, 2)], 1.0);
-            // As accurate as least squares on the true inliers, except for the few outliers that fit by chance.
+            // As accurate as least squares on the true inliers, except for the few outliers that fit by chance: half a pixel, times the
+            // magnification at the corner, by which perspective amplifies every error there.
             let oracle = refine_homography(&h, &m[..100]).unwrap();
-            prop_assert!(corner_error(&found.model, &h) < 2.0 * corner_error(&oracle, &h) + 0.5);
+            let tolerance = 0.5 * largest_magnification(&h).max(1.0);
+            prop_assert!(corner_error(&found.model, &h) < 2.0 * corner_error(&oracle, &h) + tolerance);
             let true_positives = found.inliers.iter().filter(|i| **i < 100).count();
             // 3 px is ten standard deviations of the noise, before the map's own scale of at most 2.5 and its perspective.
             prop_assert!(true_positives >= 90 && found.inliers.len() <= true_positives + 6, "{true_positives} of {}", found.inliers.len());

@@ -99,6 +99,7 @@ pub(crate) fn jobs(pixels: usize) -> Vec<Job> {
         let mut stereo = StereoOptions { smoothing, confidence: true, ..StereoOptions::default() };
         if strips {
             // Less memory than for the whole cost volume: it is processed in strips.
+            stereo.search = cv_pipeline::stereo::Search::Full;
             let matcher = cv_pipeline::stereo::StereoMatcher::new(stereo.clone()).unwrap();
             stereo.max_memory = Some(matcher.memory(width, height) * 3 / 4);
         }
