@@ -13,6 +13,9 @@ use cv_core::Progress;
 /// Rows by which strips overlap: aggregation paths that start farther away hardly change the sums.
 pub(crate) const STRIP_OVERLAP: usize = 32;
 
+/// Limits that are tried until one suffices; each has room for one more of the coarser levels than the last.
+const MAX_LIMIT_TRIALS: usize = 8;
+
 /// Fewest rows of a strip: lower ones would mostly repeat the overlap.
 const MIN_STRIP_ROWS: usize = 32;
 
@@ -80,6 +83,26 @@ impl StereoMatcher {
         Self::new(options).is_ok_and(|matcher| matcher.memory(width, height) <= allowed)
     }
 
+    /// Returns a memory limit under which images of this size can be matched, close to the smallest one.
+    fn smallest_limit(&self, width: usize, height: usize) -> usize {
+        let in_low_strips = |matcher: &Self| {
+            let coarse = matcher.coarse_memory(width, height);
+            let of = |rows| matcher.memory_of(width, height, rows, coarse);
+            of(MIN_STRIP_ROWS).min(of(height))
+        };
+        let mut limit = in_low_strips(self);
+        // The limit decides on the coarser levels too: a larger one has room for them, and needs more.
+        for _ in 0..MAX_LIMIT_TRIALS {
+            let options = StereoOptions { max_memory: Some(limit), ..self.options().clone() };
+            let Ok(matcher) = Self::new(options) else { break };
+            if matcher.memory(width, height) <= limit {
+                break;
+            }
+            limit = limit.max(in_low_strips(&matcher));
+        }
+        limit
+    }
+
     /// Refuses image sizes that are not possible with these options.
     pub(crate) fn check_size(&self, width: usize, height: usize) -> Result<(), StereoError> {
         self.check_memory(width, height, self.memory(width, height))
@@ -99,10 +122,7 @@ impl StereoMatcher {
         }
         let allowed = options.max_memory.unwrap_or(isize::MAX as usize);
         if bytes > allowed {
-            let coarse = self.coarse_memory(width, height);
-            let of = |rows| self.memory_of(width, height, rows, coarse);
-            let needed = of(MIN_STRIP_ROWS).min(of(height));
-            return Err(StereoError::Memory { needed, allowed });
+            return Err(StereoError::Memory { needed: self.smallest_limit(width, height), allowed });
         }
         Ok(())
     }
@@ -122,5 +142,35 @@ impl StereoMatcher {
         self.prepare_aggregation(width, height, progress)?;
         map.resize(width, height);
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_refusal_names_a_limit_that_suffices() {
+        for (width, height, disparities, search) in [
+            (320, 240, 64, Search::Auto),
+            (1600, 1200, 128, Search::Full),
+            // From here on hierarchical, where the limit allows.
+            (2000, 1500, 128, Search::Auto),
+            (4000, 3000, 128, Search::Auto),
+            (1600, 1200, 256, Search::Hierarchical),
+        ] {
+            let matcher = |max_memory| {
+                StereoMatcher::new(StereoOptions { disparities, search, max_memory, ..Default::default() }).unwrap()
+            };
+            let whole = matcher(None).memory(width, height);
+            for percent in [1, 20, 40, 60, 80, 99] {
+                let allowed = whole / 100 * percent;
+                let Err(error) = matcher(Some(allowed)).check_size(width, height) else { continue };
+                let StereoError::Memory { needed, allowed: reported } = error else { panic!("{error}") };
+                assert!(reported == allowed && needed > allowed, "{width} {percent}: {needed}");
+                matcher(Some(needed)).check_size(width, height).unwrap();
+            }
+            assert!(matcher(Some(whole)).check_size(width, height).is_ok());
+        }
     }
 }
