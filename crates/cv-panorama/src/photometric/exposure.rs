@@ -29,21 +29,13 @@ pub struct Gains {
     pub gains: Vec<[f32; 3]>,
     /// `v₁` and `v₂`: radiance at distance r from the image center (1 at the corners) is multiplied by `exp(v₁ r² + v₂ r⁴)`.
     pub vignetting: [f32; 2],
-    /// Stops by which red, green and blue of each photograph exceed the level at which they clip, where another photograph shows them and another channel is not clipped: their median,
-    /// for the panorama's estimate of clipped channels. `None` where too little shows it.
-    pub clipped_stops: Vec<[Option<f32>; 3]>,
     /// `p₀`, `p₁`, `p₂`: the radiance of a level `v`, 0 to 1, is that of sRGB times `2^((1 − v)(p₀ + p₁ v + p₂ v²))`.
     pub response: [f64; 3],
 }
 
 impl Gains {
     pub(crate) fn none(photos: usize) -> Self {
-        Self {
-            gains: vec![[1.0; 3]; photos],
-            vignetting: [0.0; 2],
-            clipped_stops: vec![[None; 3]; photos],
-            response: [0.0; 3],
-        }
+        Self { gains: vec![[1.0; 3]; photos], vignetting: [0.0; 2], response: [0.0; 3] }
     }
 
     /// Returns the maximum gain in stops, 0 or more: the headroom above white.
@@ -177,88 +169,41 @@ pub(crate) fn estimate_gains(
     let n = 3 * photos;
     gains.vignetting = std::array::from_fn(|k| (solution[n + k] * std::f64::consts::LN_2) as f32);
     gains.response = std::array::from_fn(|k| solution[n + 2 + k]);
-    gains.clipped_stops = clipped_stops(&samples, unknowns, &solution);
     anchor(&mut gains, preview, photo_of);
     stage.add(1)?;
     Ok(gains)
 }
 
-/// Minimum number of samples of a clipped channel for an estimate of its radiance.
-const MIN_CLIPPED_SAMPLES: usize = 20;
-/// Radiance of a clipped sample below its bound, in stops, from which on the photographs show different things.
-const MAX_BOUND_VIOLATION: f64 = 0.3;
-
-/// Estimates [`Gains::clipped_stops`].
-fn clipped_stops(samples: &[Sample], unknowns: Unknowns, solution: &DVector<f64>) -> Vec<[Option<f32>; 3]> {
-    let mut excess: Vec<[Vec<f64>; 3]> = (0..unknowns.photos).map(|_| Default::default()).collect();
-    for s in samples {
-        // Of a color that is clipped in all channels nothing remains.
-        let partly = s.levels.map(|l| l.iter().min() < Some(&CLIPPED));
-        for c in 0..3 {
-            let [a, b] = s.levels.map(|l| l[c]);
-            let residual = Response::srgb(f64::from(a) / 255.0) - Response::srgb(f64::from(b) / 255.0)
-                + unknowns.terms(s, c).iter().map(|&(k, t)| t * solution[k]).sum::<f64>();
-            // The radiance by the other photograph, beyond the bound.
-            let (photo, beyond) = match (a >= CLIPPED && partly[0], b >= CLIPPED && partly[1]) {
-                (true, false) if (MIN_LEVEL..CLIPPED).contains(&b) => (s.a, -residual),
-                (false, true) if (MIN_LEVEL..CLIPPED).contains(&a) => (s.b, residual),
-                _ => continue,
-            };
-            if beyond > -MAX_BOUND_VIOLATION {
-                excess[photo][c].push(beyond.max(0.0));
-            }
-        }
-    }
-    let median = |values: &mut Vec<f64>| match values.len() {
-        MIN_CLIPPED_SAMPLES.. => cv_core::median(values).map(|v| v as f32),
-        _ => None,
-    };
-    excess.iter_mut().map(|channels| channels.each_mut().map(median)).collect()
-}
-
-/// Range of exposures, in stops, from which on the mean level is bounded: equal exposures keep their levels.
-const MIN_EXPOSURE_SPREAD: f32 = 0.1;
 /// Maximum number of preview pixels sampled for the mean level.
 const MAX_MEAN_SAMPLES: usize = 10_000;
 
 /// Chooses the common exposure, which the overlaps leave free: the mean level of the panorama is kept at that of the photographs, clamped to the range of their means. Each canvas
-/// position counts once, with the mean of the photographs that cover it, and in the panorama with the photograph whose center is nearest. (Where several photographs cover the dark parts of a scene and one the bright parts, that exceeds the mean of every photograph.)
+/// position counts once, with the mean of the photographs that cover it. (Where several photographs cover the dark parts of a scene and one the bright parts, that exceeds the mean of every photograph.)
 fn anchor(gains: &mut Gains, preview: &Preview, photo_of: &[usize]) {
     let (width, height) = (preview.width, preview.height);
     let step = (width * height).div_ceil(MAX_MEAN_SAMPLES).max(1);
     let mut colors = Vec::new();
-    let mut nearest = Vec::new();
+    let (mut places, mut of_photo) = (0.0, vec![(0.0, 0.0); gains.gains.len()]);
     for (x, y) in (0..width * height).step_by(step).map(|i| (i % width, i / width)) {
         let first = colors.len();
         for (piece, &photo) in preview.pieces.iter().zip(photo_of) {
             let b = piece.warped.bounds;
             if let Some(color) = piece.warped.color(x, y) {
-                let i = (y - b.top) * b.width() + x - b.left;
-                colors.push((color.map(f32::from), piece.radius[i], photo, piece.eccentricity[i]));
+                let color = color.map(f32::from);
+                let (sum, count) = &mut of_photo[photo];
+                *sum += f64::from(color.iter().sum::<f32>());
+                *count += 1.0;
+                colors.push((color, piece.radius[(y - b.top) * b.width() + x - b.left], photo, 0.0));
             }
         }
-        let here = &colors[first..];
-        if let Some(best) = here.iter().min_by(|a, b| a.3.total_cmp(&b.3)) {
-            // What the panorama will show, about, and the mean level of the photographs.
-            let sum: f32 = here.iter().flat_map(|c| c.0).sum();
-            nearest.push((*best, f64::from(sum) / here.len() as f64));
-        }
+        let share = 1.0 / (colors.len() - first).max(1) as f64;
+        colors[first..].iter_mut().for_each(|c| c.3 = share);
+        places += f64::from(u8::from(colors.len() > first));
     }
-    let before: f64 = nearest.iter().map(|(_, mean)| mean).sum();
-    // Equal exposures keep their levels: means by what the canvas shows of the photographs. Others are bounded by the photographs themselves.
-    let stops = || gains.gains.iter().map(|g| g[1].log2());
-    let spread = stops().fold(f32::MIN, f32::max) - stops().fold(f32::MAX, f32::min);
-    let mut on_canvas = vec![(0.0, 0.0); gains.gains.len()];
-    for (color, _, photo, _) in &colors {
-        on_canvas[*photo].0 += f64::from(color.iter().sum::<f32>()) / 3.0;
-        on_canvas[*photo].1 += 1.0;
-    }
-    let own = |photo: usize| preview.photo_means.get(photo).copied().filter(|_| spread > MIN_EXPOSURE_SPREAD);
-    let seen = on_canvas.iter().enumerate().filter(|(_, (_, count))| *count > 0.0);
-    let means: Vec<f64> = seen.map(|(photo, (sum, count))| own(photo).unwrap_or(sum / count)).collect();
-    let (darkest, brightest) = means.iter().fold((f64::INFINITY, 0.0_f64), |m, v| (m.0.min(*v), m.1.max(*v)));
-    let sum_of_levels = 3.0 * nearest.len() as f64;
-    let before = before.min(brightest * sum_of_levels).max(darkest.min(brightest) * sum_of_levels);
+    let means = || of_photo.iter().filter(|(_, count)| *count > 0.0).map(|(sum, count)| sum / count);
+    let (darkest, brightest) = (means().fold(f64::INFINITY, f64::min), means().fold(0.0, f64::max));
+    let before: f64 = colors.iter().map(|(color, _, _, share)| share * f64::from(color[0] + color[1] + color[2])).sum();
+    let before = before.min(brightest * places).max(darkest.min(brightest) * places);
     let shifted = |stops: f64| {
         let factor = stops.exp2() as f32;
         Gains { gains: gains.gains.iter().map(|g| g.map(|g| g * factor)).collect(), ..gains.clone() }
@@ -270,12 +215,12 @@ fn anchor(gains: &mut Gains, preview: &Preview, photo_of: &[usize]) {
         let tone = tried.tone(1);
         let corrections: Vec<_> =
             (0..gains.gains.len()).map(|photo| ExposureCorrection::new(&tone, &tried, photo)).collect();
-        let after: f64 = nearest
+        let after: f64 = colors
             .iter()
-            .map(|((color, r2, photo, _), _)| {
+            .map(|(color, r2, photo, share)| {
                 let correction = &corrections[*photo];
                 let levels = correction.levels(*color, correction.vignetting_stops(*r2));
-                f64::from(levels[0] + levels[1] + levels[2])
+                share * f64::from(levels[0] + levels[1] + levels[2])
             })
             .sum();
         if after < before { low = middle } else { high = middle }
@@ -397,7 +342,7 @@ mod tests {
 
     /// Three photographs of 60 x 40, 30 apart, of one scene, their light multiplied by known factors and less toward their corners.
     fn preview(factors: &[[f64; 3]; 3], fall_off: f64, contrast: f64, moved: bool) -> Preview {
-        let pieces: Vec<Piece> = (0..3)
+        let pieces = (0..3)
             .map(|k| {
                 let bounds = Bounds { left: 30 * k, top: 0, right: 30 * k + 60, bottom: 40 };
                 let radius: Vec<f32> = (0..60 * 40)
@@ -417,17 +362,7 @@ mod tests {
                 Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: radius.clone(), radius, clipped }
             })
             .collect();
-        Preview { step: 1, width: 120, height: 40, photo_means: means(&pieces), pieces }
-    }
-
-    /// Mean level of each photograph.
-    fn means(pieces: &[Piece]) -> Vec<f64> {
-        let mean = |p: &Piece| {
-            let pixels = p.warped.pixels.as_slice().as_chunks::<4>().0;
-            let sum: u64 = pixels.iter().flat_map(|p| &p[..3]).map(|v| u64::from(*v)).sum();
-            sum as f64 / (3 * pixels.len()) as f64
-        };
-        pieces.iter().map(mean).collect()
+        Preview { step: 1, width: 120, height: 40, pieces }
     }
 
     fn estimate(preview: &Preview) -> Gains {
@@ -522,8 +457,7 @@ mod tests {
             let (radius, clipped) = (vec![0.0; 60 * 40], vec![false; 60 * 40]);
             Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: radius.clone(), radius, clipped }
         };
-        let pieces = vec![piece(0), piece(1)];
-        let mut set = Preview { step: 1, width: 90, height: 40, photo_means: means(&pieces), pieces };
+        let mut set = Preview { step: 1, width: 90, height: 40, pieces: vec![piece(0), piece(1)] };
         let gains = estimate_gains(&set, &[0, 1], 2, Exposure::Match, &Silent).unwrap();
         set.correct(&gains, &[0, 1]);
         let level = |x: usize| f64::from(set.pieces[usize::from(x >= 60)].warped.color(x, 7).unwrap()[0]);

@@ -106,8 +106,6 @@ pub(crate) struct ExposureCorrection<'a> {
     pub(crate) vignetting: [f32; 2],
     /// Radiance above which a sample is clipped; white is 1. For linear radiance only.
     pub(crate) clipped: f32,
-    /// Expected radiance of clipped red, green and blue beyond their bound, in stops.
-    pub(crate) clipped_lift: [f32; 3],
 }
 
 impl<'a> ExposureCorrection<'a> {
@@ -115,11 +113,7 @@ impl<'a> ExposureCorrection<'a> {
     pub(crate) fn new(tone: &'a Tone, gains: &Gains, photo: usize) -> Self {
         let gain = gains.gains.get(photo).map_or([0.0; 3], |g| g.map(f32::log2));
         let clipped = gains.clipped();
-        // Without an observation: half of what the photograph is darkened by.
-        let known = gains.clipped_stops.get(photo).copied().unwrap_or_default();
-        let lift = |c: usize| known[c].map_or(-0.5 * gain[c], |stops| stops.min(-gain[c]));
-        let clipped_lift = std::array::from_fn(|c| lift(c).max(0.0));
-        Self { tone, gain, clipped, clipped_lift, vignetting: gains.vignetting.map(|v| v * std::f32::consts::LOG2_E) }
+        Self { tone, gain, clipped, vignetting: gains.vignetting.map(|v| v * std::f32::consts::LOG2_E) }
     }
 
     /// Returns the vignetting correction, in stops, at a squared distance from the image center.
@@ -130,8 +124,7 @@ impl<'a> ExposureCorrection<'a> {
 
     /// Maps a color of the photograph to levels of the panorama; `lift` is an additional gain in stops.
     ///
-    /// A color clipped in all channels is a lower bound, not a measurement: it stays white for any gain. One clipped in some channels is lifted in those, so that a blue sky that is darkened
-    /// does not turn green.
+    /// A color clipped in all channels is a lower bound, not a measurement: it stays white for any gain.
     pub(crate) fn levels(&self, color: [f32; 3], lift: f32) -> [f32; 3] {
         let [mut r, mut g, mut b] = color.map(|v| [v]);
         self.row_of_levels::<false>([&mut r, &mut g, &mut b], &[lift], &mut [0.0]);
@@ -143,25 +136,17 @@ impl<'a> ExposureCorrection<'a> {
     pub(crate) fn row_of_levels<const FINE: bool>(&self, colors: [&mut [f32]; 3], lifts: &[f32], clipped: &mut [f32]) {
         /// Smallest channel at which a color begins to count as clipped, and at which it counts fully.
         const CLIPPED: [f32; 2] = [228.0, 252.0];
-        /// Distance of the smallest channel from the former level at which a channel's own clipping counts fully: what is nearly white hardly exceeds it.
-        const COLORED: f32 = 24.0;
-        /// Level at which a channel begins to count as clipped by itself, and at which it counts fully.
-        const CHANNEL_CLIPPED: [f32; 2] = [236.0, 252.0];
         let n = lifts.len();
         let ([r, g, b], clipped) = (colors.map(|c| &mut c[..n]), &mut clipped[..n]);
         for (((clipped, r), g), b) in clipped.iter_mut().zip(&*r).zip(&*g).zip(&*b) {
-            let beyond = r.min(*g).min(*b) - CLIPPED[0];
-            let share = (beyond * (1.0 / (CLIPPED[1] - CLIPPED[0]))).clamp(0.0, 1.0);
-            // Negative for colors: how far they are from white.
-            *clipped = share * share * (3.0 - 2.0 * share) + (beyond * (1.0 / COLORED)).clamp(-1.0, 0.0);
+            let share = ((r.min(*g).min(*b) - CLIPPED[0]) * (1.0 / (CLIPPED[1] - CLIPPED[0]))).clamp(0.0, 1.0);
+            *clipped = share * share * (3.0 - 2.0 * share);
         }
         // One channel at a time, so that lookups of different pixels overlap.
-        for ((values, gain), clipped_lift) in [r, g, b].into_iter().zip(self.gain).zip(self.clipped_lift) {
+        for (values, gain) in [r, g, b].into_iter().zip(self.gain) {
             for ((value, lift), clipped) in values.iter_mut().zip(lifts).zip(&*clipped) {
-                let beyond = (*value - CHANNEL_CLIPPED[0]) * (1.0 / (CHANNEL_CLIPPED[1] - CHANNEL_CLIPPED[0]));
-                let stops = gain + lift - clipped_lift * beyond.clamp(0.0, 1.0) * clipped.min(0.0);
-                let tone = self.tone.level(self.tone.index::<FINE>(*value) + stops * ENTRIES_PER_STOP);
-                *value = tone + clipped.max(0.0) * (255.0 - tone);
+                let tone = self.tone.level(self.tone.index::<FINE>(*value) + (gain + lift) * ENTRIES_PER_STOP);
+                *value = tone + clipped * (255.0 - tone);
             }
         }
     }
@@ -172,7 +157,7 @@ mod tests {
     use super::*;
 
     fn correction(tone: &Tone, stops: f32) -> ExposureCorrection<'_> {
-        ExposureCorrection { tone, gain: [stops; 3], vignetting: [0.0; 2], clipped: 1.0, clipped_lift: [0.0; 3] }
+        ExposureCorrection { tone, gain: [stops; 3], vignetting: [0.0; 2], clipped: 1.0 }
     }
 
     #[test]

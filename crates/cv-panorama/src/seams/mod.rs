@@ -365,7 +365,6 @@ mod tests {
             step: 1,
             width: SIZE.0,
             height: SIZE.1,
-            photo_means: Vec::new(),
             pieces: vec![piece(0, 120, 70), piece(40, 160, 82)],
         }
     }

@@ -71,13 +71,7 @@ mod tests {
             };
             Piece { warped: drawn(bounds, color), radius: eccentricity.clone(), eccentricity, clipped: vec![false; n] }
         };
-        Preview {
-            step: 1,
-            width: SIZE.0,
-            height: SIZE.1,
-            photo_means: vec![128.0; photographs],
-            pieces: (0..photographs).map(piece).collect(),
-        }
+        Preview { step: 1, width: SIZE.0, height: SIZE.1, pieces: (0..photographs).map(piece).collect() }
     }
 
     /// Pixels of the composite that show a person.

@@ -14,8 +14,6 @@ pub(crate) struct Preview {
     pub(crate) step: usize,
     pub(crate) width: usize,
     pub(crate) height: usize,
-    /// Mean gray level of each photograph; 0 where it has no placement.
-    pub(crate) photo_means: Vec<f64>,
     /// In the order of the layout's placements.
     pub(crate) pieces: Vec<Piece>,
 }
@@ -113,11 +111,6 @@ impl Preview {
         let s = 1.0 / step as f64;
         let surface = Surface { scale: layout.surface.scale * s, ..layout.surface };
         let (width, height) = (layout.width.div_ceil(step), layout.height.div_ceil(step));
-        let mean = |photo: &RgbU8| {
-            let sum: u64 = photo.as_slice().iter().map(|v| u64::from(*v)).sum();
-            sum as f64 / photo.as_slice().len().max(1) as f64
-        };
-        let photo_means = small.iter().map(|photo| photo.as_ref().map_or(0.0, mean)).collect();
         let draw = |(k, p): (usize, &Placement)| {
             let Some(Some(photo)) = small.get(p.photo) else { return Ok(None) };
             // The surface origin is canvas position −origin.
@@ -142,7 +135,7 @@ impl Preview {
         };
         let pieces: Vec<Option<Piece>> =
             layout.placements.par_iter().enumerate().map(draw).collect::<Result<_, Cancelled>>()?;
-        Ok(Self { step, width, height, photo_means, pieces: pieces.into_iter().flatten().collect() })
+        Ok(Self { step, width, height, pieces: pieces.into_iter().flatten().collect() })
     }
 
     /// Applies the exposure correction to every piece.
@@ -162,8 +155,7 @@ impl Preview {
     /// Returns the preview at half resolution.
     pub(crate) fn halved(&self) -> Self {
         let pieces = self.pieces.par_iter().map(Piece::halved).collect();
-        let photo_means = self.photo_means.clone();
-        Self { step: 2 * self.step, width: self.width / 2, height: self.height / 2, photo_means, pieces }
+        Self { step: 2 * self.step, width: self.width / 2, height: self.height / 2, pieces }
     }
 }
 
