@@ -361,12 +361,7 @@ mod tests {
                 eccentricity,
             }
         };
-        Preview {
-            step: 1,
-            width: SIZE.0,
-            height: SIZE.1,
-            pieces: vec![piece(0, 120, 70), piece(40, 160, 82)],
-        }
+        Preview { step: 1, width: SIZE.0, height: SIZE.1, pieces: vec![piece(0, 120, 70), piece(40, 160, 82)] }
     }
 
     /// What a seam costs in gray levels, by the colors on both of its sides.

@@ -461,12 +461,7 @@ mod tests {
             *d = cv_core::Vector2::new(0.7 * (i as f64 * 0.9).sin(), 0.6 * (i as f64 * 1.7).cos());
         }
         field.update_source_shift(&p, &surface);
-        let gains = Gains {
-            gains: vec![[0.8, 1.2, 1.5]],
-            vignetting: [0.2, 0.1],
-            response: [0.3, -0.2, 0.1],
-            ..Gains::none(1)
-        };
+        let gains = Gains { gains: vec![[0.8, 1.2, 1.5]], vignetting: [0.2, 0.1], response: [0.3, -0.2, 0.1] };
         let tone = gains.tone(1);
         let correction = ExposureCorrection::new(&tone, &gains, 0);
         let settings = WarpSettings { displacement: Some(&field), correction: Some(correction), ..PLAIN };
