@@ -6,7 +6,7 @@ mod streamed;
 
 use crate::frame::{Context, Failure, Global, Outcome, Output, Run, Step, expand_images, named, spare_inputs, steps};
 use crate::{rig, words};
-use cv_core::{Image, ImageView};
+use cv_core::{Camera, Image, ImageView};
 use cv_io::{DynImage, Metadata, Pixels, PngPixels};
 use cv_pipeline::panorama_types::{
     BlendMode, CameraMotion, EightBits, Exposure, Framing, PhotoSample, Projection, Registration, Seams,
@@ -228,6 +228,22 @@ impl Args {
         endings.iter().any(|ending| own.eq_ignore_ascii_case(ending))
     }
 
+    /// Reads the camera file, once for each size of photographs; empty without one.
+    fn cameras(
+        &self,
+        sizes: impl Iterator<Item = (usize, usize)>,
+        context: &Context,
+    ) -> Result<BTreeMap<(usize, usize), Camera>, Failure> {
+        let mut cameras = BTreeMap::new();
+        let Some(path) = &self.camera else { return Ok(cameras) };
+        for size in sizes {
+            if let Entry::Vacant(place) = cameras.entry(size) {
+                place.insert(rig::camera(path, Some(size), context)?);
+            }
+        }
+        Ok(cameras)
+    }
+
     /// Stitches images at their bit depth and writes the results. `known` has the focal lengths by EXIF and the metadata.
     fn stitch<T>(
         &self,
@@ -242,15 +258,7 @@ impl Args {
         for<'a> ImageView<'a, T, 3>: PngPixels,
         for<'a> ImageView<'a, T, 4>: PngPixels,
     {
-        // The camera file is read once for each image size.
-        let mut cameras = BTreeMap::new();
-        if let Some(path) = &self.camera {
-            for image in images {
-                if let Entry::Vacant(place) = cameras.entry(image.size()) {
-                    place.insert(rig::camera(path, Some(image.size()), context)?);
-                }
-            }
-        }
+        let cameras = self.cameras(images.iter().map(Image::size), context)?;
         let photos: Vec<PanoramaPhoto<'_, T>> = images
             .iter()
             .zip(known)

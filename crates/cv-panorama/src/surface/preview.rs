@@ -89,15 +89,15 @@ impl Preview {
         progress: &dyn Progress,
     ) -> Result<Self, Cancelled> {
         let stage = Stage::new(progress, "preview", photos.len() + layout.placements.len())?;
-        let PreviewScale { shrink, .. } = PreviewScale::new(layout, resolution, max_pixels);
+        let scale = PreviewScale::new(layout, resolution, max_pixels);
         let small = |(i, photo): (usize, &ImageView<'_, u8, 3>)| {
             let is_placed = layout.placements.iter().any(|p| p.photo == i);
-            let small = is_placed.then(|| downsample_box(*photo, shrink, &stage)).transpose()?;
+            let small = is_placed.then(|| downsample_box(*photo, scale.shrink, &stage)).transpose()?;
             stage.add(1)?;
             Ok(small)
         };
         let small: Vec<Option<RgbU8>> = photos.par_iter().enumerate().map(small).collect::<Result<_, Cancelled>>()?;
-        Self::draw_small(&small, layout, fields, PreviewScale::new(layout, resolution, max_pixels), &stage)
+        Self::draw_small(&small, layout, fields, scale, &stage)
     }
 
     /// As [`Preview::draw`], of photographs downsampled by [`PreviewScale::shrink`]; `None` for those that are not placed.

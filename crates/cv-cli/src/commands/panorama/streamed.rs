@@ -2,7 +2,7 @@
 
 use super::{Args, ENDINGS, metadata, outcome, report};
 use crate::frame::{Context, Explain, Failure, Outcome, Output};
-use crate::{rig, words};
+use crate::words;
 use cv_core::{Image, ImageView, RgbU8};
 use cv_io::{DynImage, ImageHeader, IoError, Metadata, PngPixels, RowWriter};
 use cv_pipeline::panorama_types::{
@@ -12,7 +12,6 @@ use cv_pipeline::panorama_types::{
 use cv_pipeline::{PanoramaError, PanoramaPrior, PanoramaResult, panorama_streamed};
 use cv_report::shrink_to_fit;
 use std::borrow::Cow;
-use std::collections::btree_map::{BTreeMap, Entry};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
@@ -203,14 +202,7 @@ impl Args {
         for<'v> ImageView<'v, T, 4>: PngPixels,
     {
         let Files { paths, headers, .. } = *files;
-        let mut cameras = BTreeMap::new();
-        if let Some(path) = &self.camera {
-            for header in headers {
-                if let Entry::Vacant(place) = cameras.entry(header.size) {
-                    place.insert(rig::camera(path, Some(header.size), context)?);
-                }
-            }
-        }
+        let cameras = self.cameras(headers.iter().map(|header| header.size), context)?;
         let prior = |header: &ImageHeader| PanoramaPrior {
             focal: header.exif.focal.as_ref().map(|focal| focal.pixels),
             camera: cameras.get(&header.size).copied(),
