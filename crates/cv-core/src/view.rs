@@ -31,6 +31,13 @@ impl<'a, T: Sample, const C: usize> ImageView<'a, T, C> {
 
     size_accessors!();
 
+    /// Returns this view as one of `D` channels, or `None` unless `D` is `C`: generic code can thus call code for a fixed number of channels.
+    #[inline]
+    pub fn with_channels<const D: usize>(self) -> Option<ImageView<'a, T, D>> {
+        let Self { data, width, height, stride } = self;
+        (C == D).then_some(ImageView { data, width, height, stride })
+    }
+
     /// Returns the samples of row `y`.
     ///
     /// # Panics
@@ -145,6 +152,14 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn only_the_own_number_of_channels_is_accepted() {
+        let image = Image::<u8, 3>::from_fn(4, 2, |x, y| [x as u8, y as u8, 7]);
+        let crop = image.view().crop(1, 0, 2, 2).unwrap();
+        assert_eq!(crop.with_channels::<3>().unwrap().to_image(), crop.to_image());
+        assert!(crop.with_channels::<1>().is_none());
     }
 
     #[test]

@@ -190,7 +190,15 @@ impl WarpMap {
         for_rows(out, |y, row| {
             let blocks = &self.blocks[y * per_row..][..per_row];
             match (T::as_bytes(frame), T::as_bytes_mut(row)) {
-                (Some(frame), Some(row)) => self.remap_byte_row(level, frame, blocks, row),
+                (Some(frame), Some(row)) => {
+                    if let Some(gray) = frame.with_channels() {
+                        self.remap_gray_row(level, gray, blocks, row);
+                    } else if let Some(rgb) = frame.with_channels() {
+                        self.remap_rgb_row(level, rgb, blocks, row);
+                    } else {
+                        self.interpolate_blocks(frame, blocks, row);
+                    }
+                }
                 _ => self.remap_row(frame, blocks, &self.fine[y * per_row..][..per_row], row),
             }
         });
@@ -238,7 +246,34 @@ impl WarpMap {
         }
     }
 
-    /// Warps one row of 8-bit samples.
+    /// As [`WarpMap::remap_byte_row`] of one channel. Not generic, so that it is compiled with the optimizations of this crate, whatever those of
+    /// the caller's crate are.
+    #[inline(never)]
+    fn remap_gray_row(&self, level: Level, frame: ImageView<'_, u8, 1>, blocks: &[Block], out: &mut [u8]) {
+        self.remap_byte_row(level, frame, blocks, out);
+    }
+
+    /// As [`WarpMap::remap_gray_row`] of RGB.
+    #[inline(never)]
+    fn remap_rgb_row(&self, level: Level, frame: ImageView<'_, u8, RGB_CHANNELS>, blocks: &[Block], out: &mut [u8]) {
+        self.remap_byte_row(level, frame, blocks, out);
+    }
+
+    /// Warps pixel by pixel.
+    #[inline(always)]
+    fn interpolate_blocks<const C: usize>(&self, frame: ImageView<'_, u8, C>, blocks: &[Block], out: &mut [u8]) {
+        for (block, out) in blocks.iter().zip(out.chunks_mut(LANES * C)) {
+            for (k, out) in out.as_chunks_mut::<C>().0.iter_mut().enumerate() {
+                *out = [0; C];
+                if block.inside >> k & 1 == 1 {
+                    *out = interpolate_bytes(frame, self.base(block, k), block.fractions(k));
+                }
+            }
+        }
+    }
+
+    /// Warps one row of 8-bit samples with SIMD, pixel by pixel where blocks do not fit into windows.
+    #[inline(always)]
     fn remap_byte_row<const C: usize>(
         &self,
         level: Level,
@@ -277,14 +312,7 @@ impl WarpMap {
                     clear_outside::<C>(one, first);
                     clear_outside::<C>(two, second);
                 }
-                _ => pair.iter().zip(out.chunks_mut(LANES * C)).for_each(|(block, out)| {
-                    for (k, out) in out.as_chunks_mut::<C>().0.iter_mut().enumerate() {
-                        *out = [0; C];
-                        if block.inside >> k & 1 == 1 {
-                            *out = interpolate_bytes(frame, self.base(block, k), block.fractions(k));
-                        }
-                    }
-                }),
+                _ => self.interpolate_blocks(frame, pair, out),
             }
         }
     }
