@@ -60,6 +60,36 @@ fn an_exr_has_the_radiance_at_the_exposure_of_the_reference() {
 }
 
 #[test]
+fn a_deep_zoom_image_has_the_size_of_the_panorama_and_the_same_tiles_when_streamed() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, names) = landscape(folder.path(), 2, 1.0);
+    let args = |output: &'static str, more: &[&'static str]| {
+        let all = ["panorama", &names[0], &names[1], "-o", output].into_iter().chain(more.iter().copied());
+        json(folder.path(), &all.collect::<Vec<_>>())
+    };
+    let value = args("web/a.dzi", &[]);
+    args("web/b.dzi", &["--max-memory", "2000"]);
+    let read = |name: &str| std::fs::read(folder.path().join("web").join(name)).unwrap();
+    let xml = String::from_utf8(read("a.dzi")).unwrap();
+    let [width, height] = [0, 1].map(|i| value["size"][i].as_u64().unwrap());
+    assert!(xml.contains(&format!("<Size Width=\"{width}\" Height=\"{height}\"/>")), "{xml}");
+    assert_eq!(xml.as_bytes(), read("b.dzi"));
+    let levels = width.max(height).next_power_of_two().ilog2();
+    for level in 0..=levels {
+        // The first tile, and that the number of tiles agrees.
+        assert_eq!(read(&format!("a_files/{level}/0_0.jpg")), read(&format!("b_files/{level}/0_0.jpg")), "{level}");
+        let count = |name: &str| std::fs::read_dir(folder.path().join(format!("web/{name}/{level}"))).unwrap().count();
+        let side = |n: u64| n.div_ceil(1 << (levels - level)).div_ceil(254);
+        assert_eq!([count("a_files"), count("b_files")], [(side(width) * side(height)) as usize; 2]);
+    }
+    // A folder of that name that is not ours is refused before the work.
+    std::fs::create_dir(folder.path().join("web/c_files")).unwrap();
+    let refused = run(folder.path(), &["panorama", &names[0], &names[1], "-o", "web/c.dzi"]);
+    assert_eq!(refused.code, Some(1));
+    assert!(refused.stderr.contains("c_files exists and does not belong to a Deep Zoom image"), "{}", refused.stderr);
+}
+
+#[test]
 fn exif_orientation_does_not_change_the_panorama() {
     let folder = tempfile::tempdir().unwrap();
     let mut sizes = Vec::new();

@@ -7,6 +7,7 @@ use cv_core::ImageView;
 use jpeg_encoder::JpegColorType;
 use png::{BitDepth, ColorType, Compression, Filter};
 
+use crate::encode_rows::write_image_rows;
 use crate::encode_tiff::{Samples, encode_samples};
 use crate::files::write_bytes;
 use crate::{FormatError, IoError, Metadata};
@@ -156,6 +157,25 @@ fn encode_jpeg_parts(
     Ok(bytes)
 }
 
+/// Encodes 8-bit samples without padding as JPEG.
+pub(crate) fn encode_jpeg_samples(
+    (width, height): (usize, usize),
+    color: ColorType,
+    samples: &[u8],
+    quality: u8,
+) -> Result<Vec<u8>, FormatError> {
+    encode_jpeg_parts((width, height, color, BitDepth::Eight, samples.to_vec()), quality, &Metadata::default())
+}
+
+/// Encodes 8-bit samples without padding as PNG.
+pub(crate) fn encode_png_samples(
+    (width, height): (usize, usize),
+    color: ColorType,
+    samples: &[u8],
+) -> Result<Vec<u8>, FormatError> {
+    encode_png_parts((width, height, color, BitDepth::Eight, samples.to_vec()), &Metadata::default(), None)
+}
+
 /// Encodes a JPEG whose rows are requested from `image`, from the top.
 pub(crate) fn encode_jpeg_rows<W: Write>(
     sink: W,
@@ -224,6 +244,9 @@ pub(crate) fn push_ycbcr(row: &[u8], [luma, blue, red, _]: &mut [Vec<u8>; 4]) {
 /// Quality of JPEG files, 1 to 100.
 pub(crate) const JPEG_QUALITY: u8 = 95;
 
+/// What is not supported about other file names.
+pub(crate) const UNKNOWN_EXTENSION: &str = "an extension other than .png, .tif, .tiff, .jpg, .jpeg and .dzi";
+
 /// Writes a JPEG at quality 95.
 ///
 /// # Errors
@@ -246,16 +269,22 @@ fn encode_tiff_parts((width, height, color, depth, bytes): Parts, metadata: &Met
     encode_samples(&Samples { width, height, channels: color.samples(), depth, bytes: &bytes }, metadata)
 }
 
-/// Writes an image in the format of the file name's extension: `.png`, `.tif` or `.tiff`, or `.jpg` or `.jpeg`. Metadata are written as by
-/// [`write_png_with`].
+/// Writes an image in the format of the file name's extension: `.png`, `.tif` or `.tiff`, `.jpg` or `.jpeg`, or `.dzi`
+/// ([Deep Zoom](crate::write_image_rows)). Metadata are written as by [`write_png_with`].
 ///
 /// # Errors
-/// [`FormatError::Unsupported`] for another extension; [`FormatError::NotRepresentable`] for a JPEG of 16 bits or with alpha; else as
-/// [`encode_png`], [`encode_tiff`], [`encode_jpeg`] and [`crate::write_atomic`].
+/// [`FormatError::Unsupported`] for another extension; [`FormatError::NotRepresentable`] for a JPEG of 16 bits or with alpha and for a Deep Zoom
+/// image of 16 bits; else as [`encode_png`], [`encode_tiff`], [`encode_jpeg`] and [`crate::write_atomic`].
 pub fn write_image(path: impl AsRef<Path>, view: impl PngPixels, metadata: &Metadata) -> Result<(), IoError> {
     let path = path.as_ref();
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     let parts = view.parts();
+    if extension.as_deref() == Some("dzi") {
+        return write_image_rows(path, |rows| {
+            rows.set_size(parts.0, parts.1);
+            rows.write_parts(parts).map_err(|reason| IoError::writing(path, reason))
+        });
+    }
     let bytes = match extension.as_deref() {
         Some("png") => encode_png_parts(parts, metadata, None),
         Some("tif" | "tiff") => encode_tiff_parts(parts, metadata),
@@ -266,9 +295,7 @@ pub fn write_image(path: impl AsRef<Path>, view: impl PngPixels, metadata: &Meta
             let what = if parts.3 == BitDepth::Eight { "alpha" } else { "samples of 16 bits" };
             Err(FormatError::NotRepresentable { format: "JPEG", what: what.to_owned() })
         }
-        _ => {
-            Err(FormatError::unsupported("the file name", "an extension other than .png, .tif, .tiff, .jpg and .jpeg"))
-        }
+        _ => Err(FormatError::unsupported("the file name", UNKNOWN_EXTENSION)),
     };
     write_bytes(path, &bytes.map_err(|reason| IoError::writing(path, reason))?)
 }

@@ -1,6 +1,7 @@
 //! Writing images row by row, without the whole image in memory.
 
-use crate::encode::{JPEG_QUALITY, Parts, PngPixels, encode_jpeg_rows, png_writer, push_ycbcr};
+use crate::encode::{JPEG_QUALITY, Parts, PngPixels, UNKNOWN_EXTENSION, encode_jpeg_rows, png_writer, push_ycbcr};
+use crate::encode_dzi::DziWriter;
 use crate::encode_tiff::{TiffLayout, TiffPosition, TiffWriter};
 use crate::files::write_atomic_file;
 use crate::{FormatError, IoError, Metadata};
@@ -33,6 +34,8 @@ pub struct RowWriter<'a> {
 enum Encoder {
     Png(Box<png::StreamWriter<'static, Sink>>),
     Tiff(Box<TiffWriter<Sink>>),
+    /// The file is written at the end, after the tiles.
+    Dzi(Box<DziWriter>, File),
     /// JPEG is encoded at the end, from the pixels in a temporary file.
     Jpeg {
         pixels: Sink,
@@ -73,7 +76,7 @@ impl RowWriter<'_> {
         self.write_parts(rows.parts())
     }
 
-    fn write_parts(&mut self, (width, rows, color, depth, bytes): Parts) -> Result<(), FormatError> {
+    pub(crate) fn write_parts(&mut self, (width, rows, color, depth, bytes): Parts) -> Result<(), FormatError> {
         let wrong = || FormatError::corrupt("image", format!("{width}×{rows} more pixels do not fit its size"));
         let size = self.size.filter(|size| size.0 == width && rows <= self.rows_left).ok_or_else(wrong)?;
         self.rows_left -= rows;
@@ -83,6 +86,7 @@ impl RowWriter<'_> {
         match &mut self.encoder {
             Some(Encoder::Png(writer)) => Ok(writer.write_all(&bytes)?),
             Some(Encoder::Tiff(writer)) => writer.write(&bytes),
+            Some(Encoder::Dzi(writer, _)) => writer.write(&bytes),
             Some(Encoder::Jpeg { pixels, .. }) => Ok(pixels.write_all(&bytes)?),
             None => Ok(()),
         }
@@ -113,6 +117,10 @@ impl RowWriter<'_> {
                 let sink = BufWriter::with_capacity(BUFFER_BYTES, file);
                 Ok(Encoder::Tiff(Box::new(TiffWriter::new(sink, layout, &self.metadata, self.position)?)))
             }
+            Some("dzi") => {
+                let writer = DziWriter::new(self.path, (width, height), (color, depth))?;
+                Ok(Encoder::Dzi(Box::new(writer), file))
+            }
             Some("jpg" | "jpeg") if depth == BitDepth::Eight && color == ColorType::Rgb => {
                 if width.max(height) > usize::from(u16::MAX) || width * height == 0 {
                     return Err(too_large("JPEG"));
@@ -122,10 +130,7 @@ impl RowWriter<'_> {
                 Ok(Encoder::Jpeg { pixels: BufWriter::with_capacity(BUFFER_BYTES, pixels), file })
             }
             Some("jpg" | "jpeg") => Err(refused("JPEG", "anything but colors of 8 bits, row by row".to_owned())),
-            _ => Err(FormatError::unsupported(
-                "the file name",
-                "an extension other than .png, .tif, .tiff, .jpg and .jpeg",
-            )),
+            _ => Err(FormatError::unsupported("the file name", UNKNOWN_EXTENSION)),
         }
     }
 
@@ -136,6 +141,7 @@ impl RowWriter<'_> {
         match self.encoder {
             Some(Encoder::Png(writer)) => writer.finish().map_err(png_error),
             Some(Encoder::Tiff(writer)) => writer.finish(),
+            Some(Encoder::Dzi(writer, mut file)) => Ok(file.write_all(writer.finish()?.as_bytes())?),
             Some(Encoder::Jpeg { pixels, file }) => {
                 let (width, height) = self.size.unwrap_or_default();
                 let mut pixels = pixels.into_inner().map_err(io::IntoInnerError::into_error)?;
@@ -191,8 +197,11 @@ impl jpeg_encoder::ImageBuffer for SpooledRows<'_> {
     }
 }
 
-/// Writes an image row by row, in the format of the file name's extension: `.png`, `.tif` or `.tiff`, or `.jpg` or `.jpeg` (8-bit colors). The file appears when
-/// `write` has succeeded, as by [`write_atomic`](crate::write_atomic).
+/// Writes an image row by row, in the format of the file name's extension: `.png`, `.tif` or `.tiff`, `.jpg` or `.jpeg` (8-bit colors), or `.dzi`. The file appears
+/// when `write` has succeeded, as by [`write_atomic`](crate::write_atomic).
+///
+/// A Deep Zoom image `a.dzi` (8 bits) has its tiles in a folder `a_files` beside it: tiles of 254 px with an overlap of 1 px, as JPEG, or PNG with alpha. The
+/// folder of an existing `a.dzi` is replaced.
 ///
 /// # Errors
 /// Whatever `write` fails with; [`IoError`] as for [`write_image`](crate::write_image), and where rows are missing.

@@ -39,6 +39,7 @@ mod codec;
 pub mod colmap;
 mod depth_png;
 mod encode;
+mod encode_dzi;
 mod encode_exr;
 mod encode_rows;
 mod encode_tiff;
@@ -72,6 +73,7 @@ pub use encode::{
     JpegPixels, PngPixels, encode_jpeg, encode_png, encode_tiff, write_image, write_jpeg, write_png,
     write_png_to_print, write_png_with,
 };
+pub use encode_dzi::check_deep_zoom;
 pub use encode_exr::{encode_exr, write_exr};
 pub use encode_rows::{RowWriter, write_image_rows};
 pub use error::{FormatError, IoError};

@@ -148,6 +148,40 @@ impl Channel for u8 {
     }
 }
 
+/// The methods that compile whole stages for a bit depth. In each implementation rather than in the trait: a provided method would be generic, and
+/// compiled again in every crate that calls it, with the optimizations of that crate.
+macro_rules! compiled_here {
+    () => {
+        #[inline(never)]
+        fn blender(mode: BlendMode) -> &'static dyn Blender<Self> {
+            of_mode(mode)
+        }
+
+        #[inline(never)]
+        fn draw(
+            photos: &[ImageView<'_, Self, 3>],
+            alignment: &Alignment,
+            options: &CompositingOptions,
+            blender: &dyn Blender<Self>,
+            progress: &dyn Progress,
+        ) -> Result<Panorama<Self>, RenderError> {
+            draw(photos, alignment, options, blender, progress)
+        }
+
+        #[inline(never)]
+        fn draw_streamed(
+            photos: &dyn PhotoSource<Self>,
+            alignment: &Alignment,
+            options: &CompositingOptions,
+            limit: MemoryLimit,
+            output: &mut dyn RowSink<Self>,
+            progress: &dyn Progress,
+        ) -> Result<Panorama<Self>, RenderError> {
+            draw_streamed(photos, alignment, options, limit, output, progress)
+        }
+    };
+}
+
 impl Internals for u8 {
     fn index(self) -> usize {
         usize::from(self)
@@ -172,18 +206,6 @@ impl Internals for u8 {
         Ok(Some(photo))
     }
 
-    #[inline(never)]
-    fn draw_streamed(
-        photos: &dyn PhotoSource<Self>,
-        alignment: &Alignment,
-        options: &CompositingOptions,
-        limit: MemoryLimit,
-        output: &mut dyn RowSink<Self>,
-        progress: &dyn Progress,
-    ) -> Result<Panorama<Self>, RenderError> {
-        draw_streamed(photos, alignment, options, limit, output, progress)
-    }
-
     fn bytes_of(samples: &[Self]) -> Cow<'_, [u8]> {
         Cow::Borrowed(samples)
     }
@@ -192,21 +214,7 @@ impl Internals for u8 {
         read(samples)
     }
 
-    #[inline(never)]
-    fn blender(mode: BlendMode) -> &'static dyn Blender<Self> {
-        of_mode(mode)
-    }
-
-    #[inline(never)]
-    fn draw(
-        photos: &[ImageView<'_, Self, 3>],
-        alignment: &Alignment,
-        options: &CompositingOptions,
-        blender: &dyn Blender<Self>,
-        progress: &dyn Progress,
-    ) -> Result<Panorama<Self>, RenderError> {
-        draw(photos, alignment, options, blender, progress)
-    }
+    compiled_here!();
 }
 
 impl Channel for u16 {
@@ -278,18 +286,6 @@ impl Internals for u16 {
         photos.iter().map(|photo| photo.as_ref().map(copy).transpose()).collect::<Result<_, _>>().map(Cow::Owned)
     }
 
-    #[inline(never)]
-    fn draw_streamed(
-        photos: &dyn PhotoSource<Self>,
-        alignment: &Alignment,
-        options: &CompositingOptions,
-        limit: MemoryLimit,
-        output: &mut dyn RowSink<Self>,
-        progress: &dyn Progress,
-    ) -> Result<Panorama<Self>, RenderError> {
-        draw_streamed(photos, alignment, options, limit, output, progress)
-    }
-
     fn bytes_of(samples: &[Self]) -> Cow<'_, [u8]> {
         Cow::Owned(samples.iter().flat_map(|v| v.to_ne_bytes()).collect())
     }
@@ -301,21 +297,7 @@ impl Internals for u16 {
         Ok(())
     }
 
-    #[inline(never)]
-    fn blender(mode: BlendMode) -> &'static dyn Blender<Self> {
-        of_mode(mode)
-    }
-
-    #[inline(never)]
-    fn draw(
-        photos: &[ImageView<'_, Self, 3>],
-        alignment: &Alignment,
-        options: &CompositingOptions,
-        blender: &dyn Blender<Self>,
-        progress: &dyn Progress,
-    ) -> Result<Panorama<Self>, RenderError> {
-        draw(photos, alignment, options, blender, progress)
-    }
+    compiled_here!();
 }
 
 /// Rounds to the nearest of 8 bits.

@@ -129,6 +129,7 @@ mod tests {
     use crate::sgm::Aggregator;
     use crate::{Census, StereoOptions, window_sweep};
     use cv_synth::instruction_sets;
+    use fearless_simd::Level;
     use proptest::prelude::*;
 
     /// Census bits by definition.
@@ -184,6 +185,54 @@ mod tests {
         gray
     }
 
+    /// A pair of images with its priors, and the result of the reference.
+    struct Pair<'a> {
+        options: &'a StereoOptions,
+        gray: [Gray; 2],
+        priors: &'a [Prior],
+        p2: Penalties,
+        expected: (Vec<Winner>, Vec<u16>),
+    }
+
+    impl<'a> Pair<'a> {
+        fn new(options: &'a StereoOptions, images: &[Vec<u16>; 2], width: usize, priors: &'a [Prior]) -> Self {
+            let height = images[0].len() / width;
+            let bits = images.each_ref().map(|g| census_reference(g, width, height, options.census));
+            let values = images.each_ref().map(|g| intensity_reference(g, width, options.intensity_cost));
+            let expected = match_reference(options, &images[0], [&bits[0], &bits[1]], &values, priors, width, height);
+            let gray = images.each_ref().map(|g| padded(g, width, height));
+            Self { options, gray, priors, p2: Penalties::new(options), expected }
+        }
+
+        /// Calls `f` with the frame of the fast matcher on an instruction set.
+        fn with_frame(&self, level: Level, layout: Layout, f: impl FnOnce(&Frame<'_>)) {
+            let &StereoOptions { census, intensity_cost, disparities, min_disparity, p1, confidence, .. } =
+                self.options;
+            let min_disparity = i64::from(min_disparity);
+            let (mut left, mut right, mut gray) = (Vec::new(), Vec::new(), Vec::new());
+            describe(level, &self.gray[0], census, intensity_cost, &mut left);
+            describe_mirrored(level, &self.gray[1], census, intensity_cost, min_disparity, layout, &mut right);
+            self.gray[0].to_bytes(&mut gray);
+            f(&Frame {
+                width: self.gray[0].width,
+                height: self.gray[0].height,
+                min_disparity,
+                disparities,
+                layout,
+                planes: planes(census, intensity_cost),
+                left: &left,
+                right: &right,
+                gray: &gray,
+                given: None,
+                priors: self.priors,
+                intensity_cap: (intensity_cost != IntensityCost::None).then_some(intensity_cost.cap()),
+                p1,
+                p2: &self.p2,
+                second: confidence,
+            });
+        }
+    }
+
     fn options() -> impl Strategy<Value = StereoOptions> {
         let window = prop_oneof![Just(Census::Window5x5), Just(Census::Window7x7), Just(Census::Window9x7)];
         // Ranges below, at and above one block and one group; penalties that do and do not saturate.
@@ -222,7 +271,6 @@ mod tests {
             levels_of_gray in prop_oneof![Just(2u16), Just(5), Just(200)],
         ) {
             options.validate().unwrap();
-            let StereoOptions { census, intensity_cost, disparities, .. } = options;
             // A splitmix sequence: noise on the left, shifted noise on the right.
             let noise = |i: usize| {
                 let mut z = seed.wrapping_add((i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15));
@@ -231,37 +279,20 @@ mod tests {
             };
             let left: Vec<u16> = (0..width * height).map(noise).collect();
             let right: Vec<u16> = (0..width * height).map(|i| noise(if i % 5 == 0 { i + 7 } else { i + 3 })).collect();
-            let bits = [&left, &right].map(|g| census_reference(g, width, height, options.census));
-            let blended = [&left, &right].map(|g| intensity_reference(g, width, options.intensity_cost));
-            let prior = |i: usize| Prior::new((noise(i + 11) as usize * 31 % disparities) as u16, (noise(i + 5) % 4) as u8);
+            let prior = |i: usize| Prior::new((noise(i + 11) as usize * 31 % options.disparities) as u16, (noise(i + 5) % 4) as u8);
             let priors: Vec<Prior> = if has_priors { (0..width * height).map(prior).collect() } else { Vec::new() };
-            let expected = match_reference(&options, &left, [&bits[0], &bits[1]], &blended, &priors, width, height);
-
-            let gray = [padded(&left, width, height), padded(&right, width, height)];
-            let min_disparity = i64::from(options.min_disparity);
-            let p2 = Penalties::new(&options);
+            let pair = Pair::new(&options, &[left, right], width, &priors);
             for level in instruction_sets() {
-                let layout = Layout::new(level, disparities);
-                let (mut a, mut b, mut bytes) = (Vec::new(), Vec::new(), Vec::new());
-                describe(level, &gray[0], census, intensity_cost, &mut a);
-                describe_mirrored(level, &gray[1], census, intensity_cost, min_disparity, layout, &mut b);
-                gray[0].to_bytes(&mut bytes);
-                let frame = Frame {
-                    width, height, min_disparity, disparities, layout, planes: planes(census, intensity_cost),
-                    left: &a, right: &b, gray: &bytes,
-                    given: None,
-                    priors: &priors,
-                    intensity_cap: (intensity_cost != IntensityCost::None).then_some(intensity_cost.cap()),
-                    p1: options.p1, p2: &p2, second: options.confidence,
-                };
                 let mut aggregator = Aggregator::default();
-                // Twice, so that state left by a frame would show.
-                for _ in 0..2 {
-                    let stage = cv_core::Stage::new(&cv_core::Silent, "", 0).unwrap();
-                    aggregator.run(level, &frame, options.paths == Paths::Eight, &stage).unwrap();
-                    prop_assert_eq!(&aggregator.winners, &expected.0, "{:?}", level);
-                    prop_assert_eq!(&aggregator.right, &expected.1, "{:?}", level);
-                }
+                pair.with_frame(level, Layout::new(level, options.disparities), |frame| {
+                    // Twice, so that state left by a frame would show.
+                    for _ in 0..2 {
+                        let stage = cv_core::Stage::new(&cv_core::Silent, "", 0).unwrap();
+                        aggregator.run(level, frame, options.paths == Paths::Eight, &stage).unwrap();
+                        assert_eq!(aggregator.winners, pair.expected.0, "{level:?}");
+                        assert_eq!(aggregator.right, pair.expected.1, "{level:?}");
+                    }
+                });
             }
         }
 
@@ -273,39 +304,22 @@ mod tests {
             seed in any::<u64>(),
         ) {
             let options = StereoOptions { disparities: WINDOW, paths: Paths::Four, ..options };
-            let StereoOptions { census, intensity_cost, disparities, .. } = options;
             let noise = |i: usize| ((seed.wrapping_add(i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40) as u16 % 5) * 13_107;
             let left: Vec<u16> = (0..width * height).map(noise).collect();
             let right: Vec<u16> = (0..width * height).map(|i| noise(i + 3)).collect();
-            let bits = [&left, &right].map(|g| census_reference(g, width, height, options.census));
-            let blended = [&left, &right].map(|g| intensity_reference(g, width, options.intensity_cost));
             let priors: Vec<Prior> = (0..width * height).map(|i| Prior::new(noise(i + 11) % 32, (noise(i + 5) % 4) as u8)).collect();
-            let expected = match_reference(&options, &left, [&bits[0], &bits[1]], &blended, &priors, width, height);
-            let gray = [padded(&left, width, height), padded(&right, width, height)];
-            let min_disparity = i64::from(options.min_disparity);
-            let p2 = Penalties::new(&options);
+            let pair = Pair::new(&options, &[left, right], width, &priors);
             let mut windows = SearchWindows::default();
             for level in instruction_sets() {
-                let layout = Layout::new(level, disparities).contiguous();
-                let (mut a, mut b, mut bytes) = (Vec::new(), Vec::new(), Vec::new());
-                describe(level, &gray[0], census, intensity_cost, &mut a);
-                describe_mirrored(level, &gray[1], census, intensity_cost, min_disparity, layout, &mut b);
-                gray[0].to_bytes(&mut bytes);
-                let frame = Frame {
-                    width, height, min_disparity, disparities, layout, planes: planes(census, intensity_cost),
-                    left: &a, right: &b, gray: &bytes,
-                    given: None,
-                    priors: &priors,
-                    intensity_cap: (intensity_cost != IntensityCost::None).then_some(intensity_cost.cap()),
-                    p1: options.p1, p2: &p2, second: options.confidence,
-                };
-                windows.set(level, &vec![5.0; (width / 2) * (height / 2)], width / 2, (options.min_disparity, disparities));
+                windows.set(level, &vec![5.0; (width / 2) * (height / 2)], width / 2, (options.min_disparity, options.disparities));
                 let mut winners = vec![Winner::default(); width * height];
                 let mut right = vec![0; width * height];
                 let stage = cv_core::Stage::new(&cv_core::Silent, "", 0).unwrap();
                 let output = (&mut winners[..], &mut right[..]);
-                window_sweep::aggregate(level, &frame, &windows, &mut Vec::new(), output, &stage).unwrap();
-                prop_assert_eq!(&winners, &expected.0, "{:?}", level);
+                pair.with_frame(level, Layout::new(level, options.disparities).contiguous(), |frame| {
+                    window_sweep::aggregate(level, frame, &windows, &mut Vec::new(), output, &stage).unwrap();
+                });
+                prop_assert_eq!(&winners, &pair.expected.0, "{:?}", level);
             }
         }
     }

@@ -20,7 +20,9 @@ use std::collections::btree_map::{BTreeMap, Entry};
 use std::path::{Path, PathBuf};
 
 /// The extensions of the output formats.
-const ENDINGS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff", "exr"];
+const ENDINGS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff", "exr", "dzi"];
+/// Those that have 8 bits a channel only.
+const EIGHT_BIT_ENDINGS: &[&str] = &["jpg", "jpeg", "dzi"];
 
 /// Stitch overlapping photographs.
 #[derive(Debug, clap::Args)]
@@ -33,6 +35,7 @@ const ENDINGS: &[&str] = &["png", "jpg", "jpeg", "tif", "tiff", "exr"];
     cv panorama raw16/*.tif -o pano.tif --layers layers/\n  \
     cv panorama square/ -o empty.png --clean\n  \
     cv panorama gigapixel/ -o huge.tif --max-memory 4096\n  \
+    cv panorama gigapixel/ -o web/huge.dzi --max-memory 4096\n  \
     cv panorama window/*.jpg -o light.exr\n  \
     cv panorama wide/ -o pano.png --camera cam.yaml\n  \
     cv panorama wall/ -o plan.tif --mode plane\n  \
@@ -48,7 +51,7 @@ pub(crate) struct Args {
     images: Vec<PathBuf>,
     /// Where to write the panorama: .png, .tif or .jpg; the first two have 16 bits a channel if a photograph has. Or .exr: scene-referred linear radiance as 32-bit floats, with the
     /// camera response, exposures and vignetting inverted, and samples clipped in one photograph taken from another. A radiance of 1 is white at the center of the reference photograph;
-    /// brighter radiance is above 1.
+    /// brighter radiance is above 1. Or .dzi: a Deep Zoom image for viewers in browsers such as OpenSeadragon, with its tiles in a folder NAME_files beside it.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Camera motion: rotation about the camera center, or arbitrary motion in front of a planar scene such as a map, a wall or the ground (plane), drawn as a
@@ -183,8 +186,10 @@ impl Run for Args {
         if !(self.scale > 0.0 && self.scale <= 10.0) {
             return Err(Failure::usage(format!("--scale must be above 0 and at most 10, not {}", self.scale)));
         }
-        let is_jpeg = self.ends_in(&["jpg", "jpeg"]);
-        if self.alpha && is_jpeg {
+        if self.ends_in(&["dzi"]) {
+            cv_io::check_deep_zoom(&self.output)?;
+        }
+        if self.alpha && self.ends_in(&["jpg", "jpeg"]) {
             return Err(Failure::usage("--alpha needs a .png or .tif: JPEG has no transparency"));
         }
         if self.alpha && self.ends_in(&["exr"]) {
@@ -211,7 +216,7 @@ impl Run for Args {
         let known: Vec<_> =
             pictures.iter().map(|p| (p.exif.focal.as_ref().map(|focal| focal.pixels), p.metadata.clone())).collect();
         let is_deep = |picture: &DynImage| matches!(picture.pixels, Pixels::Gray16(_) | Pixels::Rgb16(_));
-        if !is_jpeg && pictures.iter().any(is_deep) {
+        if !self.ends_in(EIGHT_BIT_ENDINGS) && pictures.iter().any(is_deep) {
             let images: Vec<_> = pictures.into_par_iter().map(DynImage::into_rgb16).collect();
             self.stitch(&paths, &images, &known, registration.as_ref(), context)
         } else {

@@ -1,6 +1,6 @@
 //! Panoramas under `--max-memory`: photographs are read when they are needed, and the panorama is written row by row.
 
-use super::{Args, ENDINGS, metadata, outcome, report};
+use super::{Args, EIGHT_BIT_ENDINGS, ENDINGS, metadata, outcome, report};
 use crate::frame::{Context, Explain, Failure, Outcome, Output};
 use crate::words;
 use cv_core::{Image, ImageView, RgbU8};
@@ -180,7 +180,7 @@ impl Args {
         context: &Context,
     ) -> Result<Outcome, Failure> {
         let headers = paths.iter().map(cv_io::read_image_header).collect::<Result<Vec<_>, _>>()?;
-        if !self.ends_in(&["jpg", "jpeg"]) && headers.iter().any(|header| header.depth == 2) {
+        if !self.ends_in(EIGHT_BIT_ENDINGS) && headers.iter().any(|header| header.depth == 2) {
             let files = Files { paths, headers: &headers, convert: DynImage::into_rgb16, failure: Mutex::default() };
             self.stitch_files(&files, registration, max_memory, context)
         } else {
