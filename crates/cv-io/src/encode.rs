@@ -256,10 +256,10 @@ pub fn write_jpeg(path: impl AsRef<Path>, view: impl JpegPixels) -> Result<(), I
     write_bytes(path, &encode_jpeg(view, JPEG_QUALITY).map_err(|reason| IoError::writing(path, reason))?)
 }
 
-/// Encodes a TIFF file with Deflate compression.
+/// Encodes a TIFF file with Deflate compression; BigTIFF where it may exceed 4 GiB.
 ///
 /// # Errors
-/// [`FormatError::NotRepresentable`] for an empty image or one of more than 4 GB.
+/// [`FormatError::NotRepresentable`] for an empty image.
 pub fn encode_tiff(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
     encode_tiff_parts(view.parts(), &Metadata::default())
 }

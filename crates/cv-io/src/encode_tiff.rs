@@ -1,6 +1,7 @@
 //! Writing TIFF: strips with Deflate compression after horizontal differencing (TIFF 6.0, section 14, and Adobe's technical note on Deflate),
-//! little-endian.
+//! little-endian. BigTIFF where 32-bit positions may not suffice.
 
+use crate::big_tiff::to_big_tiff;
 use crate::{FormatError, Metadata};
 use exif::experimental::Writer;
 use exif::{Context, Field, In, Tag, Value};
@@ -25,7 +26,7 @@ pub(crate) struct Samples<'a> {
 /// Encodes a TIFF file.
 ///
 /// # Errors
-/// [`FormatError::NotRepresentable`] for an empty image, and for more bytes than 32-bit offsets can address.
+/// [`FormatError::NotRepresentable`] for an empty image.
 pub(crate) fn encode_samples(samples: &Samples<'_>, metadata: &Metadata) -> Result<Vec<u8>, FormatError> {
     let Samples { width, height, channels, depth, bytes } = *samples;
     let layout = TiffLayout::new(width, height, channels, depth)?;
@@ -44,7 +45,13 @@ pub(crate) struct TiffLayout {
     channels: usize,
     /// Bytes per sample: 1 or 2.
     depth: usize,
+    /// BigTIFF, with 64-bit positions.
+    is_big: bool,
 }
+
+/// Bytes of samples from which on files are BigTIFF: compressed photographs are smaller, but by how much is unknown before. Directories and metadata have the rest
+/// of 4 GiB.
+const BIG_TIFF_BYTES: u64 = (1 << 32) - (1 << 26);
 
 impl TiffLayout {
     /// # Errors
@@ -52,7 +59,10 @@ impl TiffLayout {
     pub(crate) fn new(width: usize, height: usize, channels: usize, depth: usize) -> Result<Self, FormatError> {
         let side = |n: usize| u32::try_from(n).ok().filter(|&n| n > 0);
         match (side(width), side(height)) {
-            (Some(width), Some(height)) => Ok(Self { width, height, channels, depth }),
+            (Some(width), Some(height)) => {
+                let bytes = u128::from(width) * u128::from(height) * (channels * depth) as u128;
+                Ok(Self { width, height, channels, depth, is_big: bytes > u128::from(BIG_TIFF_BYTES) })
+            }
             _ => Err(FormatError::NotRepresentable { format: "TIFF", what: format!("an image of {width}×{height}") }),
         }
     }
@@ -68,7 +78,7 @@ impl TiffLayout {
     }
 
     fn fields(&self, metadata: &Metadata) -> Vec<Field> {
-        let Self { width, height, channels, depth } = *self;
+        let Self { width, height, channels, depth, .. } = *self;
         let numbers =
             |tag: Tag, values: &[u16]| Field { tag, ifd_num: In::PRIMARY, value: Value::Short(values.to_vec()) };
         let number = |tag: Tag, value: u32| Field { tag, ifd_num: In::PRIMARY, value: Value::Long(vec![value]) };
@@ -149,6 +159,8 @@ pub(crate) struct TiffWriter<W> {
     count: usize,
     /// Position of the first strip, and of the arrays of offsets and of byte counts.
     places: [u64; 3],
+    /// End of the last strip.
+    end: u64,
 }
 
 impl<W: Write + Seek> TiffWriter<W> {
@@ -173,17 +185,26 @@ impl<W: Write + Seek> TiffWriter<W> {
         writer.set_strips(&strips, In::PRIMARY);
         let mut head = Cursor::new(Vec::new());
         writer.write(&mut head, true).map_err(|e| FormatError::corrupt("TIFF", e.to_string()))?;
-        let head = head.into_inner();
-        let place = |tag| value_position(&head, tag).ok_or_else(|| FormatError::corrupt("TIFF", "no strips"));
-        let places = [head.len() as u64, place(273)?, place(279)?];
+        let mut head = head.into_inner();
+        let no_strips = || FormatError::corrupt("TIFF", "no strips");
+        let [offsets, byte_counts] = if layout.is_big {
+            let big = to_big_tiff(&head).ok_or_else(no_strips)?;
+            head = big.bytes;
+            [big.offsets as u64, big.byte_counts as u64]
+        } else {
+            let place = |tag| value_position(&head, tag).ok_or_else(no_strips);
+            [place(273)?, place(279)?]
+        };
+        let end = head.len() as u64;
         sink.write_all(&head)?;
-        Ok(Self { sink, layout, pending: Vec::new(), strips: Vec::with_capacity(count), count, places })
+        let strips = Vec::with_capacity(count);
+        Ok(Self { sink, layout, pending: Vec::new(), strips, count, places: [end, offsets, byte_counts], end })
     }
 
     /// Writes the next rows: big-endian samples without padding.
     ///
     /// # Errors
-    /// [`FormatError::NotRepresentable`] for more bytes than 32-bit offsets can address, and [`FormatError::Os`].
+    /// [`FormatError::Os`].
     pub(crate) fn write(&mut self, rows: &[u8]) -> Result<(), FormatError> {
         let strip = self.layout.rows() * self.layout.row();
         let mut rest = rows;
@@ -206,9 +227,10 @@ impl<W: Write + Seek> TiffWriter<W> {
         let strip = miniz_oxide::deflate::compress_to_vec_zlib(&self.pending, COMPRESSION_LEVEL);
         self.pending.clear();
         self.strips.push(strip.len() as u32);
-        let bytes: u64 = self.strips.iter().map(|n| u64::from(*n)).sum();
-        if bytes + self.places[0] > u64::from(u32::MAX) {
-            return Err(FormatError::NotRepresentable { format: "TIFF", what: "more than 4 GB".to_owned() });
+        self.end += strip.len() as u64;
+        if self.end > u64::from(u32::MAX) && !self.layout.is_big {
+            // Samples that Deflate cannot compress, with metadata of more than 64 MiB.
+            return Err(FormatError::NotRepresentable { format: "TIFF", what: "more than 4 GiB".to_owned() });
         }
         Ok(self.sink.write_all(&strip)?)
     }
@@ -225,13 +247,14 @@ impl<W: Write + Seek> TiffWriter<W> {
             return Err(FormatError::corrupt("TIFF", format!("{} of {} strips", self.strips.len(), self.count)));
         }
         let [first, offsets, counts] = self.places;
-        let mut at = first as u32;
-        let starts = self.strips.iter().map(|n| {
-            let start = at;
-            at += n;
-            start
+        let mut at = first;
+        let starts = self.strips.iter().flat_map(|n| {
+            let start = at.to_le_bytes();
+            at += u64::from(*n);
+            // The first four bytes of a little-endian number are its 32-bit value.
+            start.into_iter().take(if self.layout.is_big { 8 } else { 4 })
         });
-        let starts: Vec<u8> = starts.flat_map(u32::to_le_bytes).collect();
+        let starts: Vec<u8> = starts.collect();
         let lengths: Vec<u8> = self.strips.iter().flat_map(|n| n.to_le_bytes()).collect();
         for (place, bytes) in [(offsets, starts), (counts, lengths)] {
             self.sink.seek(SeekFrom::Start(place))?;
@@ -265,5 +288,115 @@ fn difference_u16(row: &mut [u8], channels: usize) {
     for i in (0..words.len()).rev() {
         let before = i.checked_sub(channels).map_or(0, |j| u16::from_be_bytes(words[j]));
         words[i] = u16::from_be_bytes(words[i]).wrapping_sub(before).to_le_bytes();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::read_image;
+    use tiff::decoder::{Decoder, DecodingResult, ifd};
+    use tiff::tags::Tag as TiffTag;
+
+    fn exif_block() -> Vec<u8> {
+        let text = Value::Ascii(vec![b"Makers of cameras".to_vec()]);
+        let focal = Value::Rational(vec![exif::Rational { num: 35, denom: 1 }]);
+        let fields = [(Tag::Make, text), (Tag::FocalLength, focal)].map(|(tag, value)| Field {
+            tag,
+            ifd_num: In::PRIMARY,
+            value,
+        });
+        let (mut writer, mut block) = (Writer::new(), Cursor::new(Vec::new()));
+        fields.iter().for_each(|field| writer.push_field(field));
+        writer.write(&mut block, true).unwrap();
+        block.into_inner()
+    }
+
+    #[test]
+    fn big_tiff_has_the_pixels_and_fields_of_tiff() {
+        let folder = tempfile::tempdir().unwrap();
+        // One strip, whose position is in its entry, and several.
+        for (width, height, depth) in [(5, 4, 1), (300, 700, 1), (211, 400, 2)] {
+            let samples: Vec<u8> = (0..width * height * 3 * depth).map(|i| (i * i / 7) as u8).collect();
+            let mut profile = vec![7; 500];
+            profile[16..20].copy_from_slice(b"RGB ");
+            let metadata = Metadata { exif: Some(exif_block()), icc: Some(profile.clone()) };
+            let encode = |is_big| {
+                let layout = TiffLayout { is_big, ..TiffLayout::new(width, height, 3, depth).unwrap() };
+                let mut file = Cursor::new(Vec::new());
+                let mut writer = TiffWriter::new(&mut file, layout, &metadata, None).unwrap();
+                samples.chunks(997).for_each(|part| writer.write(part).unwrap());
+                writer.finish().unwrap();
+                file.into_inner()
+            };
+            let files = [encode(false), encode(true)];
+            assert_eq!([files[0][2], files[1][2]], [42, 43]);
+            let read = files.each_ref().map(|bytes| {
+                let mut decoder = Decoder::new(Cursor::new(bytes)).unwrap();
+                let pixels = match decoder.read_image().unwrap() {
+                    DecodingResult::U8(v) => v.into_iter().map(u16::from).collect(),
+                    DecodingResult::U16(v) => v,
+                    other => panic!("{other:?}"),
+                };
+                let icc = decoder.get_tag_u8_vec(TiffTag::Unknown(34675)).unwrap();
+                let make = decoder.get_tag_ascii_string(TiffTag::Unknown(271)).unwrap();
+                // The EXIF directory is where its entry says.
+                let directory = decoder.get_tag(TiffTag::Unknown(34665)).unwrap();
+                let at = match directory {
+                    ifd::Value::Unsigned(at) => u64::from(at),
+                    ifd::Value::Ifd(at) => u64::from(at),
+                    ifd::Value::IfdBig(at) | ifd::Value::UnsignedBig(at) => at,
+                    other => panic!("{other:?}"),
+                };
+                assert!(at > 0 && at < bytes.len() as u64);
+                (pixels, icc, make)
+            });
+            let expected: Vec<u16> = if depth == 1 {
+                samples.iter().copied().map(u16::from).collect()
+            } else {
+                samples.as_chunks::<2>().0.iter().map(|b| u16::from_be_bytes(*b)).collect()
+            };
+            assert!(read[0].0 == expected && read[0] == read[1], "{width}×{height}");
+            assert!(read[1].1 == profile && read[1].2 == "Makers of cameras");
+            let path = folder.path().join("big.tif");
+            std::fs::write(&path, &files[1]).unwrap();
+            assert_eq!(read_image(&path).unwrap().into_rgb8().size(), (width, height));
+        }
+    }
+
+    #[test]
+    #[ignore = "4.6 GB on disk, minutes"]
+    fn strips_beyond_four_gigabytes_are_found() {
+        let (width, height) = (20_000, 38_000);
+        let mut file = tempfile::tempfile().unwrap();
+        let layout = TiffLayout::new(width, height, 3, 2).unwrap();
+        let mut writer = TiffWriter::new(&mut file, layout, &Metadata::default(), None).unwrap();
+        // Noise, which Deflate does not shrink.
+        let mut state = 1_u64;
+        let mut row = vec![0; 6 * width];
+        for _ in 0..height {
+            row.fill_with(|| {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                (state >> 33) as u8
+            });
+            writer.write(&row).unwrap();
+        }
+        writer.finish().unwrap();
+        assert!(file.metadata().unwrap().len() > 1 << 32);
+        file.rewind().unwrap();
+        let mut decoder = Decoder::new(&mut file).unwrap();
+        let last = decoder.strip_count().unwrap() - 1;
+        let DecodingResult::U16(strip) = decoder.read_chunk(last).unwrap() else { panic!("not 16 bits") };
+        let expected: Vec<u16> = row.as_chunks::<2>().0.iter().map(|b| u16::from_be_bytes(*b)).collect();
+        assert!(strip[strip.len() - 3 * width..] == expected);
+    }
+
+    #[test]
+    fn files_are_big_where_four_gigabytes_may_not_suffice() {
+        let is_big = |w, h, channels, depth| TiffLayout::new(w, h, channels, depth).unwrap().is_big;
+        assert!(!is_big(40_000, 30_000, 3, 1) && is_big(40_000, 30_000, 3, 2));
+        // 2³² bytes are 35,791 columns.
+        assert!(!is_big(35_200, 40_000, 3, 1) && is_big(35_791, 40_000, 3, 1));
+        assert!(is_big(u32::MAX as usize, u32::MAX as usize, 4, 2));
     }
 }

@@ -33,6 +33,7 @@
 //! | matches | [`read_matches`], [`write_matches`] |
 //! | camera positions | [`read_camera_positions`]; [`ExifInfo`] |
 
+mod big_tiff;
 mod camera;
 mod camera_positions;
 mod codec;
