@@ -46,6 +46,7 @@ fn matching_options(options: &mut Options<'_>, o: &mut StereoOptions) -> PyResul
     options.set("median", &mut o.median)?;
     options.set_named("smoothing", &mut o.smoothing)?;
     options.set("fill", &mut o.fill)?;
+    options.set("ignore_black_borders", &mut o.ignore_black_borders)?;
     options.set("quality", &mut o.quality)?;
     options.set_optional("max_memory", &mut o.max_memory)
 }
@@ -189,7 +190,7 @@ pub(crate) fn depth<'py>(
 /// The result, computed with the GIL released.
 struct Found {
     depth: DepthResult,
-    /// State of each pixel: 0 matched, 1 occluded, 2 mismatched, 3 out of view.
+    /// State of each pixel: 0 matched, 1 occluded, 2 mismatched, 3 out of view, 4 without data.
     state: Vec<u8>,
     depth_deviation: Option<GrayF32>,
     valid: f64,

@@ -19,6 +19,7 @@
 //! Disparity is `x_left − x_right` in pixels, `f32`, NaN where unknown.
 
 mod aligned_buffer;
+mod border_mask;
 mod buffer_pool;
 mod census;
 mod coarse_prior;

@@ -204,6 +204,10 @@ pub struct StereoOptions {
     pub smoothing: Smoothing,
     /// Whether rejected pixels are filled from the surrounding surfaces, as [`crate::PixelState`] says by which cause. Default true.
     pub fill: bool,
+    /// Whether the black borders of rectified images are left out: regions of exactly 0 in all channels in a corner of the image
+    /// or along half of a side, of a thousandth of it or more, with a smooth outline. Their pixels are [`crate::PixelState::NoData`]. Default true. Masks
+    /// ([`crate::StereoMatcher::set_masks`]) take precedence.
+    pub ignore_black_borders: bool,
     /// Quality mode: local expansion moves over slanted planes (Taniai et al., PAMI 2018) after semi-global matching. Takes about fifty times
     /// as long (8 to 14 µs of one core per pixel) and leaves two thirds of the errors above 2 px (Middlebury 2014, quarter size), on roads
     /// half. Default false.
@@ -238,6 +242,7 @@ impl Default for StereoOptions {
             median: 1,
             smoothing: Smoothing::Bilateral { sigma: 24.0 },
             fill: true,
+            ignore_black_borders: true,
             quality: false,
             confidence: false,
             max_memory: None,

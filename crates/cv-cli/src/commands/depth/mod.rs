@@ -31,7 +31,7 @@ pub(crate) use report::{fractions, scene};
 ///
 /// Without --rig the pair must be rectified: corresponding points lie in the same row. Disparity is the column in the
 /// left image minus the column in the right one. Occluded and mismatched pixels are filled from their surroundings
-/// unless --no-fill is given.
+/// unless --no-fill is given. The black borders of rectified images have no disparity.
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv depth left.png right.png -o disparity.pfm\n  \
@@ -215,6 +215,7 @@ impl Run for Args {
             warn_of_alignment(offset, context);
         }
         warn_of_filling(&job.maps, context);
+        report_border(map, context);
         context.report(|| report::report(&job, &[]))?;
         let (width, height) = map.disparity.size();
         Ok(Outcome::new(job.maps.stages.clone())
@@ -222,6 +223,7 @@ impl Run for Args {
             .with("height", height)
             .with("valid_fraction", valid)
             .with("matched_fraction", matched)
+            .with("no_data_fraction", map.no_data_fraction())
             .with("disparities", disparities.1)
             .with("min_disparity", disparities.0)
             .with(
@@ -245,6 +247,17 @@ fn warn_of_alignment(offset: &VerticalOffset, context: &Context) {
         offset.across,
         offset.down
     ));
+}
+
+/// Reports the black border of the left image.
+fn report_border(map: &DisparityMap, context: &Context) {
+    let fraction = map.no_data_fraction();
+    if fraction > 0.0 {
+        context.note(format!(
+            "{:.1} % of the left image is a black border of rectification: it has no disparity, and the other fractions are of the rest",
+            100.0 * fraction
+        ));
+    }
 }
 
 /// Warns if few pixels were matched, and if most of the map is filled.
