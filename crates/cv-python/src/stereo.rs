@@ -25,6 +25,7 @@ pub(crate) fn matcher_arguments(options: &mut Options<'_>) -> PyResult<(StereoOp
     options.set("min_disparity", &mut o.min_disparity)?;
     options.set("disparities", &mut o.disparities)?;
     matching_options(options, &mut o)?;
+    options.set("sequence", &mut o.sequence)?;
     Ok((o, Run::read(options)?))
 }
 
@@ -217,7 +218,8 @@ struct Worker {
     map: DisparityMap,
 }
 
-/// Semi-global matching with buffers reused between pairs, for video.
+/// Semi-global matching with buffers reused between pairs, for video. With `sequence=True` the pairs are consecutive frames, and noise is averaged over time
+/// where an image does not change.
 ///
 /// Threads may share a matcher; they use it one at a time.
 ///

@@ -50,6 +50,7 @@ mod rectify_scene;
 mod reference;
 mod search_window;
 mod select;
+mod sequence;
 mod sgm;
 mod speckle;
 mod surface_filling;

@@ -12,6 +12,7 @@ use crate::layout::Layout;
 use crate::local_expansion;
 use crate::matcher_memory::STRIP_OVERLAP;
 use crate::search_window::SearchWindows;
+use crate::sequence;
 use crate::sgm::Aggregator;
 use crate::speckle::{Speckles, remove_speckles};
 use crate::surface_filling::{self, Filling, Pair, fill};
@@ -70,6 +71,8 @@ pub struct StereoMatcher {
     speckles: Speckles,
     filling: Filling,
     scratch: Vec<f32>,
+    /// The previous frame of both views.
+    frames: [sequence::View; 2],
     smoothing: SmoothingBuffers,
     /// Buffers of the threads of hierarchical matching.
     window_sweeps: Vec<window_sweep::Buffers>,
@@ -109,6 +112,7 @@ impl StereoMatcher {
             speckles: Speckles::default(),
             filling: Filling::default(),
             scratch: Vec::new(),
+            frames: Default::default(),
             smoothing: SmoothingBuffers::default(),
             window_sweeps: Vec::new(),
             priors: Vec::new(),
@@ -169,8 +173,18 @@ impl StereoMatcher {
             }
         }
         self.mask_borders();
+        if self.options.sequence {
+            for (frame, gray) in self.frames.iter_mut().zip(&mut self.gray) {
+                frame.filter(gray);
+            }
+        }
         clock.lap("gray");
         self.compute_gray(map, clock, progress)
+    }
+
+    /// Forgets the previous frame of a sequence.
+    pub fn forget_frame(&mut self) {
+        self.frames.iter_mut().for_each(sequence::View::forget);
     }
 
     /// Sets the masks of the pair, and extends the gray levels to pixels without data.
@@ -313,6 +327,7 @@ impl StereoMatcher {
             speckle_size: self.options.speckle_size / 4,
             confidence: false,
             quality: false,
+            sequence: false,
             ..self.options.clone()
         };
         let options = if is_hierarchical {

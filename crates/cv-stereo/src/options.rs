@@ -212,6 +212,10 @@ pub struct StereoOptions {
     /// as long (8 to 14 µs of one core per pixel) and leaves two thirds of the errors above 2 px (Middlebury 2014, quarter size), on roads
     /// half. Default false.
     pub quality: bool,
+    /// Whether the pairs are consecutive frames: noise is averaged over time where an image does not change, so that disparities of still
+    /// cameras flicker half as much. Nothing is averaged where an object moved, while the camera moves, and over a cut
+    /// ([`crate::StereoMatcher::forget_frame`] starts anew). Default false.
+    pub sequence: bool,
     /// Whether [`crate::StereoMatcher::confidence`] is computed: the second best match takes a tenth of the time. Default false.
     pub confidence: bool,
     /// Maximum number of bytes of the matcher; `None` sets no limit. If the whole image does not fit, costs are aggregated in strips of rows
@@ -244,6 +248,7 @@ impl Default for StereoOptions {
             fill: true,
             ignore_black_borders: true,
             quality: false,
+            sequence: false,
             confidence: false,
             max_memory: None,
         }

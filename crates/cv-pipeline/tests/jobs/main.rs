@@ -8,6 +8,7 @@ mod generated;
 mod panorama;
 mod reconstruct;
 mod refusals;
+mod sequence;
 mod serde;
 mod stereo;
 mod tracks;

@@ -38,7 +38,7 @@ pub(crate) use report::{fractions, scene};
     cv depth left.png right.png -o d.pfm --focal 1000 --baseline 0.12 --depth depth.pfm --cloud cloud.ply\n  \
     cv depth left.png right.png --disparities auto -o disparity.npy\n  \
     cv depth left.png right.png --quality -o disparity.pfm\n  \
-    cv depth left right -o disparities\n  \
+    cv depth left right --sequence -o disparities\n  \
     cv depth left.jpg right.jpg --rig rig.yaml -o disparity.png --depth depth.png --report out\n\n\
     The extension selects the format: .pfm (floats, invalid +inf), .npy (floats, invalid NaN), .png (disparity as KITTI's\n\
     16-bit PNG, 256 steps a pixel; depth as 16-bit millimeters, if the baseline is in meters or the rig file has its unit; invalid 0).")]
@@ -57,6 +57,10 @@ pub(crate) struct Args {
     /// How frames are paired [default: by name if the names are the same, else by number]. Unpaired frames are refused.
     #[arg(long, value_name = "HOW", value_parser = named::<PairBy>())]
     pair_by: Option<PairBy>,
+    /// The frames are consecutive: average noise over time where the images do not change, so that disparities flicker half as much. Objects that move leave no trail; while
+    /// the camera moves, nothing is averaged.
+    #[arg(long)]
+    sequence: bool,
     /// Where to write the depth, in the unit of the baseline: .pfm, .png or .npy. Needs --rig, or --focal and --baseline.
     #[arg(long, value_name = "FILE")]
     depth: Option<PathBuf>,
@@ -201,6 +205,10 @@ impl Run for Args {
         }
         if self.pair_by.is_some() {
             return Err(Failure::usage("--pair-by applies to sequences of frames, not to a single pair"));
+        }
+        if self.sequence {
+            return Err(Failure::usage("--sequence applies to frames, not to a single pair")
+                .advice("give two folders or patterns of frames"));
         }
         let photos = Photos::read(&self.left, &self.right)?;
         let mut sequence = self.sequence(&photos, [&self.left, &self.right], context)?;
