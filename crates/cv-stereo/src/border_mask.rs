@@ -2,18 +2,23 @@
 //!
 //! A rectified image is black where the original has no pixel. There, black matches black at any disparity. OpenCV crops the map to the
 //! rectangle without such pixels (`getValidDisparityROI`), libSGM invalidates every black pixel, Pandora takes masks. Here borders are
-//! detected: regions of exactly 0 in all channels, in a corner of the image or along most of a side, as a rotation or the removal of distortion
+//! detected: regions of exactly 0 in all channels, in a corner of the image or along much of a side, as a rotation or the removal of distortion
 //! leaves them. Noise leaves dark scenes other values in between, and the outline of a rectified image is smooth: regions with a long
-//! outline are dark objects. (Of 340 photographs, of which some have 15 % of such pixels, one with a black picture frame in a corner has a
-//! region of 0.3 % that is none, and fifteen of a figure on a black stage have up to 1.6 %.)
+//! outline are dark objects. (Of 340 photographs, of which some have 15 % of such pixels, only some of a figure on a black stage have a region
+//! of this kind, of up to 1.6 %.)
 
+use crate::PixelState;
 use crate::census::{Gray, MARGIN};
+use crate::winner::Winner;
 use cv_core::{Mask, UnionFind};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Minimum area of a border region as a fraction of the image.
-const MIN_AREA: f64 = 1e-3;
+/// Minimum area of a border region as a fraction of the image, along much of a side and in a corner.
+const MIN_AREA: (f64, f64) = (1e-3, 5e-3);
+/// Minimum contact of a border region with a side of the image, as a fraction of the side: a rotation about the center leaves black wedges
+/// along half of each.
+const MIN_CONTACT: f64 = 0.4;
 /// Maximum length of the outline of a border region, in pixel sides inside the image, relative to half the perimeter of its bounding box. A
 /// monotonic curve has 1, a frame around the image 2, one of a lens with pincushion distortion a little more.
 const MAX_OUTLINE: f64 = 3.0;
@@ -121,14 +126,16 @@ impl BorderMask {
                 component.rows.end = y as u32 + 1;
             }
         }
-        let min_area = MIN_AREA * (width * height) as f64;
+        let pixels = (width * height) as f64;
         let is_border = |root: u32| {
             components[root as usize].as_ref().is_some_and(|c| {
                 let half_perimeter = (c.columns.len() + c.rows.len()) as f64;
                 let sides = [height, height, width, width];
-                let is_long = c.contacts.iter().zip(sides).any(|(contact, side)| 2 * contact >= side);
+                let is_long =
+                    c.contacts.iter().zip(sides).any(|(&contact, side)| contact as f64 >= MIN_CONTACT * side as f64);
+                let min_area = if is_long { MIN_AREA.0 } else { MIN_AREA.1 };
                 (c.has_corner || is_long)
-                    && c.area as f64 >= min_area
+                    && c.area as f64 >= min_area * pixels
                     && c.outline as f64 <= MAX_OUTLINE * half_perimeter
             })
         };
@@ -263,6 +270,62 @@ fn for_each_overlap(a: &[Range<u32>], b: &[Range<u32>], mut found: impl FnMut(us
     }
 }
 
+/// The borders of a matcher's pairs.
+#[derive(Debug, Default)]
+pub(crate) struct Borders {
+    /// Masks that are not to be detected.
+    given: Option<[Option<BorderMask>; 2]>,
+    /// Those of the current pair.
+    current: [Option<BorderMask>; 2],
+}
+
+impl Borders {
+    /// Sets the masks of pixels with data of all following pairs; with `None` they are detected.
+    pub(crate) fn set_given(&mut self, valid: Option<[&Mask; 2]>) {
+        let valid = valid.filter(|[left, right]| left.size() == right.size());
+        self.given = valid.map(|masks| masks.map(BorderMask::from_valid));
+    }
+
+    /// Sets the masks of a pair, and extends its gray levels to pixels without data. `scratch` is scratch.
+    pub(crate) fn update(&mut self, gray: &mut [Gray; 2], detects: bool, scratch: &mut Vec<f32>) {
+        for (i, (gray, current)) in gray.iter_mut().zip(&mut self.current).enumerate() {
+            let given = self.given.as_ref().map(|masks| &masks[i]);
+            let given = given.filter(|mask| mask.as_ref().is_none_or(|mask| mask.size() == (gray.width, gray.height)));
+            *current = match given {
+                Some(mask) => mask.clone(),
+                None => detects.then(|| BorderMask::detect(gray)).flatten(),
+            };
+            let Some(mask) = current else { continue };
+            // The interpolation of an unknown rectification mixes the outermost pixels with black.
+            let dilated = if given.is_none() { mask.dilated() } else { None };
+            dilated.as_ref().unwrap_or(mask).extend(gray, scratch);
+        }
+    }
+
+    /// Returns the borders at half resolution.
+    pub(crate) fn halved(&self) -> Self {
+        let current = self.current.each_ref().map(|mask| mask.as_ref().and_then(BorderMask::halved));
+        Self { given: None, current }
+    }
+
+    /// Returns the masks of the rows from `first` on.
+    pub(crate) fn masks(&self, first: usize) -> PairMasks<'_> {
+        let [left, right] = self.current.each_ref().map(Option::as_ref);
+        PairMasks { left, right, first }
+    }
+
+    /// Clears the pixels of the left image without data.
+    pub(crate) fn clear(&self, disparity: &mut [f32], states: &mut [PixelState]) {
+        let Some(mask) = &self.current[0] else { return };
+        let (width, height) = mask.size();
+        for (y, run) in (0..height).flat_map(|y| mask.row(y).iter().map(move |run| (y, run))) {
+            let pixels = y * width + run.start as usize..y * width + run.end as usize;
+            disparity[pixels.clone()].fill(f32::NAN);
+            states[pixels].fill(PixelState::NoData);
+        }
+    }
+}
+
 /// The masks of a pair, or of some rows of it.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct PairMasks<'a> {
@@ -313,9 +376,21 @@ impl RowMasks<'_> {
         Some([interior(self.left)?, interior(self.right)?])
     }
 
-    /// Returns the runs of the right row.
-    pub(crate) fn right(&self) -> &[Range<u32>] {
-        self.right
+    /// Rejects the matches of a row that have no data in one of the images.
+    pub(crate) fn check(&self, first: i32, winners: &[Winner], states: &mut [PixelState], disparity: &mut [f32]) {
+        for (x, (state, d)) in states.iter_mut().zip(disparity).enumerate() {
+            let column = x as i64 - i64::from(first) - i64::from(winners[x].index);
+            if self.hides_left(x) {
+                (*state, *d) = (PixelState::NoData, f32::NAN);
+            } else if usize::try_from(column).is_ok_and(|column| self.hides_right(column)) {
+                (*state, *d) = (PixelState::OutOfView, f32::NAN);
+            }
+        }
+    }
+
+    /// Fills the pixels of the right row without data.
+    pub(crate) fn fill_right(&self, values: &mut [f32], value: f32) {
+        self.right.iter().for_each(|run| values[run.start as usize..run.end as usize].fill(value));
     }
 }
 
@@ -379,7 +454,7 @@ mod tests {
         let object = |x: usize, y: usize| (40..80).contains(&x) && (20..90).contains(&y);
         assert_eq!(detected(|x, y| if object(x, y) { 0 } else { texture(x, y) }), None);
         assert_eq!(detected(|x, y| if x < 40 && (30..80).contains(&y) { 0 } else { texture(x, y) }), None);
-        assert_eq!(detected(|x, y| if x < 4 && y < 4 { 0 } else { texture(x, y) }), None);
+        assert_eq!(detected(|x, y| if x < 9 && y < 9 { 0 } else { texture(x, y) }), None);
         assert_eq!(detected(|_, _| 0), None);
         // Noise around black, of which one pixel in eight is one level or more.
         assert_eq!(detected(|x, y| if texture(x, y) < 424 { 0 } else { 257 }), None);

@@ -1,6 +1,6 @@
 //! The semi-global matcher: from a rectified pair to checked disparities.
 
-use crate::border_mask::{BorderMask, PairMasks};
+use crate::border_mask::Borders;
 use crate::census::{Gray, describe, describe_mirrored, planes};
 use crate::coarse_prior::{Prior, classify_texture, set_priors};
 use crate::confidence::{confidence, sigma};
@@ -60,9 +60,7 @@ pub struct StereoMatcher {
     level: Level,
     gray: [Gray; 2],
     gray8: Vec<u8>,
-    /// Pixels without data of both views: of [`StereoMatcher::set_masks`], and of the current pair.
-    given_masks: Option<[Option<BorderMask>; 2]>,
-    masks: [Option<BorderMask>; 2],
+    borders: Borders,
     /// Census bits and values of the intensity cost, of both views.
     described: [Vec<u8>; 2],
     aggregator: Aggregator,
@@ -104,8 +102,7 @@ impl StereoMatcher {
             level: Level::new(),
             gray: Default::default(),
             gray8: Vec::new(),
-            given_masks: None,
-            masks: Default::default(),
+            borders: Borders::default(),
             described: Default::default(),
             aggregator: Aggregator::default(),
             strip: Aggregator::default(),
@@ -130,8 +127,7 @@ impl StereoMatcher {
     /// Sets the pixels of the left and the right image that have data ([`crate::RectifiedView::apply`]), for all following pairs of this
     /// size; `None` detects black borders, as [`StereoOptions::ignore_black_borders`] says.
     pub fn set_masks(&mut self, masks: Option<[&Mask; 2]>) {
-        self.given_masks =
-            masks.filter(|[left, right]| left.size() == right.size()).map(|masks| masks.map(BorderMask::from_valid));
+        self.borders.set_given(masks);
     }
 
     /// Computes the disparities of `left`. The images are rectified: a scene point has the same y in both.
@@ -172,7 +168,7 @@ impl StereoMatcher {
                 return Err(StereoError::NotFinite { side, count });
             }
         }
-        self.mask_borders();
+        self.borders.update(&mut self.gray, self.options.ignore_black_borders, &mut self.scratch);
         if self.options.sequence {
             for (frame, gray) in self.frames.iter_mut().zip(&mut self.gray) {
                 frame.filter(gray);
@@ -185,27 +181,6 @@ impl StereoMatcher {
     /// Forgets the previous frame of a sequence.
     pub fn forget_frame(&mut self) {
         self.frames.iter_mut().for_each(sequence::View::forget);
-    }
-
-    /// Sets the masks of the pair, and extends the gray levels to pixels without data.
-    fn mask_borders(&mut self) {
-        for (i, gray) in self.gray.iter_mut().enumerate() {
-            let given = self.given_masks.as_ref().map(|masks| &masks[i]);
-            let given = given.filter(|mask| mask.as_ref().is_none_or(|mask| mask.size() == (gray.width, gray.height)));
-            let (mask, extended) = match given {
-                Some(mask) => (mask.clone(), mask.clone()),
-                None => {
-                    let mask = self.options.ignore_black_borders.then(|| BorderMask::detect(gray)).flatten();
-                    // Interpolation mixes the outermost pixels with black.
-                    let extended = mask.as_ref().and_then(|mask| mask.dilated().or_else(|| Some(mask.clone())));
-                    (mask, extended)
-                }
-            };
-            if let Some(extended) = extended {
-                extended.extend(gray, &mut self.scratch);
-            }
-            self.masks[i] = mask;
-        }
     }
 
     /// As [`StereoMatcher::compute_into`], of the gray levels in `self.gray`.
@@ -368,7 +343,7 @@ impl StereoMatcher {
         for (small, large) in matcher.gray.iter_mut().zip(&self.gray) {
             small.halve(large);
         }
-        matcher.masks = self.masks.each_ref().map(|mask| mask.as_ref().and_then(BorderMask::halved));
+        matcher.borders = self.borders.halved();
         matcher.compute_gray(map, StageClock::new(), progress)?;
         let range = (self.options.min_disparity, self.options.disparities);
         if is_hierarchical {
@@ -395,7 +370,6 @@ impl StereoMatcher {
         let p2 = Penalties::new(options);
         let rows = self.strip_rows(width, height, self.coarse_memory(width, height));
         let strips = rows.map_or(1, |rows| height.div_ceil(rows));
-        let [left_mask, right_mask] = &self.masks;
         // Each row twice, and the overlap of strips.
         let stage = Stage::new(progress, "aggregate", 2 * (height + 2 * STRIP_OVERLAP * (strips - 1)))?;
         let frame = |rows: Range<usize>| Frame {
@@ -409,7 +383,7 @@ impl StereoMatcher {
             right: &self.described[1][rows.start * stride..rows.end * stride],
             given: None,
             priors: self.priors.get(rows.start * width..rows.end * width).unwrap_or(&[]),
-            masks: PairMasks { left: left_mask.as_ref(), right: right_mask.as_ref(), first: rows.start },
+            masks: self.borders.masks(rows.start),
             intensity_cap: (options.intensity_cost != IntensityCost::None).then(|| options.intensity_cost.cap()),
             gray: &self.gray8[rows.start * width..rows.end * width],
             p1: options.p1,
@@ -447,8 +421,7 @@ impl StereoMatcher {
     /// Checks the winners (uniqueness, field of view, left-right consistency) and refines those that pass to sub-pixel accuracy.
     fn check(&self, map: &mut DisparityMap) {
         let width = map.disparity.width();
-        let [left, right] = self.masks.each_ref().map(Option::as_ref);
-        let masks = PairMasks { left, right, first: 0 };
+        let masks = self.borders.masks(0);
         let Aggregator { winners, right, .. } = &self.aggregator;
         map.disparity
             .as_mut_slice()
@@ -458,14 +431,8 @@ impl StereoMatcher {
             .enumerate()
             .for_each(|(y, ((disparity, state), (winners, right)))| {
                 dispatch!(self.level, simd => check_row(simd, &self.options, winners, right, state, disparity));
-                let Some(masks) = masks.row(y) else { return };
-                for (x, (state, d)) in state.iter_mut().zip(disparity).enumerate() {
-                    let column = x as i64 - i64::from(self.options.min_disparity) - i64::from(winners[x].index);
-                    if masks.hides_left(x) {
-                        (*state, *d) = (PixelState::NoData, f32::NAN);
-                    } else if usize::try_from(column).is_ok_and(|column| masks.hides_right(column)) {
-                        (*state, *d) = (PixelState::OutOfView, f32::NAN);
-                    }
+                if let Some(masks) = masks.row(y) {
+                    masks.check(self.options.min_disparity, winners, state, disparity);
                 }
             });
     }
@@ -475,8 +442,7 @@ impl StereoMatcher {
         let stage = Stage::new(progress, "refine", 4)?;
         let width = map.disparity.width();
         let options = &self.options;
-        let [left, right] = self.masks.each_ref().map(Option::as_ref);
-        let masks = PairMasks { left, right, first: 0 };
+        let masks = self.borders.masks(0);
         let (disparity, states) = (map.disparity.as_mut_slice(), map.state.as_mut_slice());
         remove_speckles(disparity, states, width, options.speckle_size, options.speckle_range, &mut self.speckles);
         stage.add(1)?;
@@ -498,7 +464,7 @@ impl StereoMatcher {
             std::mem::swap(&mut self.filling.right, &mut self.scratch);
             filled?;
             if !options.quality {
-                clear_masked(masks.left, disparity, states);
+                self.borders.clear(disparity, states);
             }
             stage.add(1)?;
         }
@@ -520,25 +486,12 @@ impl StereoMatcher {
             local_expansion::expand(self.level, gray, range, disparity, states, progress)?;
             surface_filling::classify_unmatched(disparity, states, width, masks, &mut self.filling);
         }
-        clear_masked(masks.left, disparity, states);
+        self.borders.clear(disparity, states);
         if options.quality && !options.fill {
             let unknown = disparity.iter_mut().zip(states).filter(|(_, state)| **state != PixelState::Matched);
             unknown.for_each(|(d, _)| *d = f32::NAN);
         }
         Ok(())
-    }
-}
-
-/// Clears the pixels without data.
-fn clear_masked(mask: Option<&BorderMask>, disparity: &mut [f32], states: &mut [PixelState]) {
-    let Some(mask) = mask else { return };
-    let (width, height) = mask.size();
-    for y in 0..height {
-        for run in mask.row(y) {
-            let pixels = y * width + run.start as usize..y * width + run.end as usize;
-            disparity[pixels.clone()].fill(f32::NAN);
-            states[pixels].fill(PixelState::NoData);
-        }
     }
 }
 

@@ -205,7 +205,7 @@ pub struct StereoOptions {
     /// Whether rejected pixels are filled from the surrounding surfaces, as [`crate::PixelState`] says by which cause. Default true.
     pub fill: bool,
     /// Whether the black borders of rectified images are left out: regions of exactly 0 in all channels in a corner of the image
-    /// or along half of a side, of a thousandth of it or more, with a smooth outline. Their pixels are [`crate::PixelState::NoData`]. Default true. Masks
+    /// (0.5 % of it or more) or along 0.4 of a side (0.1 % or more), with a smooth outline. Their pixels are [`crate::PixelState::NoData`]. Default true. Masks
     /// ([`crate::StereoMatcher::set_masks`]) take precedence.
     pub ignore_black_borders: bool,
     /// Quality mode: local expansion moves over slanted planes (Taniai et al., PAMI 2018) after semi-global matching. Takes about fifty times

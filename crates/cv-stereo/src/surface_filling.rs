@@ -8,7 +8,7 @@
 //! "PatchMatch stereo", BMVC 2011).
 
 use crate::PixelState;
-use crate::border_mask::{PairMasks, RowMasks};
+use crate::border_mask::PairMasks;
 use crate::fill_uncertainty::Extrapolation;
 use crate::layout::Layout;
 use crate::surfaces::{CELL, NONE, Plane, Surfaces, center, extent, neighbors};
@@ -209,9 +209,7 @@ fn project_matches(disparity: &[f32], states: &[PixelState], width: usize, masks
                 *nearest = if d > *nearest { d } else { *nearest };
             }
         }
-        for run in masks.row(y).iter().flat_map(RowMasks::right) {
-            right[run.start as usize..run.end as usize].fill(f32::INFINITY);
-        }
+        masks.row(y).iter().for_each(|masks| masks.fill_right(right, f32::INFINITY));
     });
 }
 
