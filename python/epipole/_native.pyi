@@ -178,8 +178,10 @@ class StereoMatcher:
         median: int | None = 1,
         smoothing: Literal["none", "bilateral", "wls"] | None = "bilateral",
         fill: bool | None = True,
+        ignore_black_borders: bool | None = True,
         quality: bool | None = False,
         max_memory: int | None = None,
+        sequence: bool | None = False,
         threads: int | None = None,
         progress: _Progress | None = None,
     ) -> StereoMatcher: ...
@@ -218,6 +220,7 @@ def depth(
     median: int | None = 1,
     smoothing: Literal["none", "bilateral", "wls"] | None = "bilateral",
     fill: bool | None = True,
+    ignore_black_borders: bool | None = True,
     quality: bool | None = False,
     max_memory: int | None = None,
     confidence: bool | None = False,

@@ -77,7 +77,7 @@ class Depth(_Result):
     disparity: NDArray[np.float32]
     """float32, px: x in the left image minus x in the right one."""
     state: NDArray[np.uint8]
-    """uint8: 0 matched, 1 occluded, 2 mismatched, 3 out of view; all but 0 are filled from their surroundings."""
+    """uint8: 0 matched, 1 occluded, 2 mismatched, 3 out of view; 1 to 3 are filled from their surroundings; 4 black border without data."""
     disparity_deviation: NDArray[np.float32]
     """float32, px: standard deviation, NaN where unknown."""
     depth: NDArray[np.float32] | None
@@ -99,9 +99,9 @@ class Depth(_Result):
     disparities: tuple[int, int]
     """Smallest disparity of the search range, and its size."""
     valid_fraction: float
-    """Fraction of the pixels with a disparity."""
+    """Fraction of the pixels with data that have a disparity."""
     matched_fraction: float
-    """Fraction of the pixels that were matched and passed the consistency checks."""
+    """Fraction of the pixels with data that were matched and passed the consistency checks."""
     seconds: dict[str, float]
     """Run time by stage."""
 

@@ -112,6 +112,13 @@ fn frames_of_a_sequence_equal_single_pairs() {
         assert!(std::fs::read(at(name)).unwrap() == expected, "{name}");
     }
     done(folder.path(), &["depth", "left/f2*", "right/f2*", "-o", "out", "--disparities", "48"]);
+    // The first frame of a sequence is a single pair; the same again has no noise to average.
+    done(folder.path(), &["depth", "left", "right", "--sequence", "-o", "in-time", "--disparities", "48"]);
+    for name in ["in-time/f2.pfm", "in-time/f10.pfm"] {
+        assert!(std::fs::read(at(name)).unwrap() == expected, "{name}");
+    }
+    let one = run(folder.path(), &["depth", "left.png", "right.png", "-o", "d.pfm", "--sequence"]);
+    assert!(one.code == Some(2) && one.stderr.contains("single pair"), "{}", one.stderr);
     refused(folder.path(), &["depth", "left/x*", "right/f2*", "-o", "out"]);
     refused(folder.path(), &["depth", "left", "right/f2*", "-o", "out"]);
     refused(folder.path(), &["depth", "left", "right", "-o", "one.pfm"]);

@@ -3,7 +3,7 @@
 use crate::depth::{check_matched_fraction, check_range, compute_depth, initial_alignment, matcher_options, to_rgb8};
 use crate::vertical_offset::{Alignment, VerticalOffset};
 use crate::{DepthError, DepthOptions, DisparityRange, Progress, RigDepthResult};
-use cv_core::{Image, ImageView, PointCloud, Pose, StageClock, Vector3};
+use cv_core::{Image, ImageView, Mask, PointCloud, Pose, StageClock, Vector3};
 use cv_imgproc::{Pixel, WarpMap};
 use cv_stereo::{DisparityMap, Intensity, Rectification, RectifyError, StereoGeometry, StereoMatcher, StereoOptions};
 use std::any::Any;
@@ -16,6 +16,8 @@ pub struct FrameDepth {
     rectification: Option<Rectification>,
     /// Warp maps of both rectified views, computed at the first frame.
     maps: Option<[WarpMap; 2]>,
+    /// Pixels of the rectified images that have data.
+    masks: Option<[Mask; 2]>,
     /// The rectified images of the last frame, whose memory is used again: two images of the frames' type.
     rectified: Option<Box<dyn Any + Send + Sync>>,
     geometry: Option<StereoGeometry>,
@@ -40,6 +42,7 @@ impl FrameDepth {
             options,
             rectification: None,
             maps: None,
+            masks: None,
             rectified: None,
             geometry,
             matcher,
@@ -79,8 +82,14 @@ impl FrameDepth {
     ) -> Result<&DisparityMap, DepthError> {
         let rectified = self.rectify([left, right], progress)?;
         let [left, right] = rectified.as_ref().map_or([left, right], |pair| pair.each_ref().map(Image::view));
-        let matcher =
-            get_or_create_matcher(&mut self.matcher, &self.options, &mut self.alignment, [left, right], progress)?;
+        let matcher = get_or_create_matcher(
+            &mut self.matcher,
+            &self.options,
+            &self.masks,
+            &mut self.alignment,
+            [left, right],
+            progress,
+        )?;
         let corrected = self.alignment.compute(matcher, [left, right], &mut self.map, progress)?;
         let right = corrected.as_ref().map_or(right, Image::view);
         let StereoOptions { min_disparity, disparities, .. } = *matcher.options();
@@ -115,8 +124,14 @@ impl FrameDepth {
             clock.lap("rectify");
         }
         let is_first = self.matcher.is_none();
-        let matcher =
-            get_or_create_matcher(&mut self.matcher, &self.options, &mut self.alignment, [left, right], progress)?;
+        let matcher = get_or_create_matcher(
+            &mut self.matcher,
+            &self.options,
+            &self.masks,
+            &mut self.alignment,
+            [left, right],
+            progress,
+        )?;
         if is_first {
             clock.lap("range");
         }
@@ -159,7 +174,14 @@ impl FrameDepth {
         }
         let maps = match self.maps.take() {
             Some(maps) => maps,
-            None => [views[0].map(progress)?, views[1].map(progress)?],
+            None => {
+                let maps = [views[0].map(progress)?, views[1].map(progress)?];
+                self.masks = Some(maps.each_ref().map(WarpMap::inside));
+                if let (Some(matcher), Some([left, right])) = (&mut self.matcher, &self.masks) {
+                    matcher.set_masks(Some([left, right]));
+                }
+                maps
+            }
         };
         let maps = self.maps.insert(maps);
         // Without memory of the same type, it is allocated.
@@ -178,13 +200,18 @@ impl FrameDepth {
 fn get_or_create_matcher<'m, T: Intensity + Pixel, const C: usize>(
     matcher: &'m mut Option<StereoMatcher>,
     options: &DepthOptions,
+    masks: &Option<[Mask; 2]>,
     alignment: &mut Alignment,
     [left, right]: [ImageView<'_, T, C>; 2],
     progress: &dyn Progress,
 ) -> Result<&'m mut StereoMatcher, DepthError> {
     let created = match matcher.take() {
         Some(created) => created,
-        None => StereoMatcher::new(matcher_options(left, right, options, alignment, progress)?)?,
+        None => {
+            let mut created = StereoMatcher::new(matcher_options(left, right, options, alignment, progress)?)?;
+            created.set_masks(masks.as_ref().map(|[left, right]| [left, right]));
+            created
+        }
     };
     Ok(matcher.insert(created))
 }

@@ -59,6 +59,7 @@ pub(crate) fn pair_depth(
         ..scene.stereo_options()
     };
     let mut matcher = StereoMatcher::new(stereo)?;
+    matcher.set_masks(Some([&rectified[0].1, &rectified[1].1]));
     let map = matcher.compute(rectified[0].0.view(), rectified[1].0.view(), progress)?;
     let sigma = matcher.uncertainty(&map);
     clock.lap("match");

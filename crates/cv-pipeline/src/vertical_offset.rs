@@ -190,6 +190,7 @@ impl Alignment {
             }
         }
         let Some(corrected) = self.corrected(right)? else { return Ok(None) };
+        matcher.forget_frame();
         matcher.compute_into(left, corrected.view(), map, progress)?;
         Ok(Some(corrected))
     }

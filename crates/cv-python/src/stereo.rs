@@ -25,6 +25,7 @@ pub(crate) fn matcher_arguments(options: &mut Options<'_>) -> PyResult<(StereoOp
     options.set("min_disparity", &mut o.min_disparity)?;
     options.set("disparities", &mut o.disparities)?;
     matching_options(options, &mut o)?;
+    options.set("sequence", &mut o.sequence)?;
     Ok((o, Run::read(options)?))
 }
 
@@ -46,6 +47,7 @@ fn matching_options(options: &mut Options<'_>, o: &mut StereoOptions) -> PyResul
     options.set("median", &mut o.median)?;
     options.set_named("smoothing", &mut o.smoothing)?;
     options.set("fill", &mut o.fill)?;
+    options.set("ignore_black_borders", &mut o.ignore_black_borders)?;
     options.set("quality", &mut o.quality)?;
     options.set_optional("max_memory", &mut o.max_memory)
 }
@@ -189,7 +191,7 @@ pub(crate) fn depth<'py>(
 /// The result, computed with the GIL released.
 struct Found {
     depth: DepthResult,
-    /// State of each pixel: 0 matched, 1 occluded, 2 mismatched, 3 out of view.
+    /// State of each pixel: 0 matched, 1 occluded, 2 mismatched, 3 out of view, 4 without data.
     state: Vec<u8>,
     depth_deviation: Option<GrayF32>,
     valid: f64,
@@ -216,7 +218,8 @@ struct Worker {
     map: DisparityMap,
 }
 
-/// Semi-global matching with buffers reused between pairs, for video.
+/// Semi-global matching with buffers reused between pairs, for video. With `sequence=True` the pairs are consecutive frames, and noise is averaged over time
+/// where an image does not change.
 ///
 /// Threads may share a matcher; they use it one at a time.
 ///

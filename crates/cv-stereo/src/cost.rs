@@ -1,8 +1,9 @@
 //! Matching costs from census bits, and the smoothness penalties of the aggregation paths.
 
 use crate::StereoOptions;
+use crate::border_mask::{PairMasks, RowMasks};
 use crate::coarse_prior::Prior;
-use crate::layout::{BLOCK, Layout, MAX_VECTORS};
+use crate::layout::{BLOCK, Layout, MAX_VECTORS, place};
 use crate::winner::outside_cost;
 use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
@@ -29,6 +30,8 @@ pub(crate) struct Frame<'a> {
     pub(crate) given: Option<&'a [u8]>,
     /// Priors, of all pixels or none.
     pub(crate) priors: &'a [Prior],
+    /// Pixels without data.
+    pub(crate) masks: PairMasks<'a>,
     /// Maximum of the intensity cost.
     pub(crate) intensity_cap: Option<u8>,
     /// Gray levels of the left image, 0 to 255.
@@ -44,9 +47,22 @@ impl Frame<'_> {
     /// be right of the image and the last ones left of it.
     #[inline(always)]
     pub(crate) fn inside(&self, x: usize) -> Range<usize> {
+        self.inside_columns(x, &(0..self.width))
+    }
+
+    /// Returns the indices whose correspondence is in these columns of the right image.
+    #[inline(always)]
+    pub(crate) fn inside_columns(&self, x: usize, columns: &Range<usize>) -> Range<usize> {
         let column = x as i64 - self.min_disparity;
         let n = self.disparities as i64;
-        (column - (self.width as i64 - 1)).clamp(0, n) as usize..(column + 1).clamp(0, n) as usize
+        let start = (column - (columns.end as i64 - 1)).clamp(0, n) as usize;
+        start..((column + 1 - columns.start as i64).clamp(0, n) as usize).max(start)
+    }
+
+    /// Returns the cost, at every disparity, of a pixel of the left image without data. The largest that does not overflow path costs, so
+    /// that the pixel is the match of no pixel of the right image.
+    pub(crate) fn masked_cost(&self) -> u8 {
+        u8::MAX - 1 - self.p2.largest - self.p1
     }
 
     /// Computes the costs of the pixels `xs` of row `y` at every disparity; 255 in the padding, so that those lanes never win and never
@@ -135,8 +151,27 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
             }
         }
     }
+    // Columns of both rows that have data.
+    let mut columns = [0..width, 0..width];
+    if let Some(masks) = frame.masks.row(y) {
+        match masks.interior(width) {
+            Some(interior) => columns = interior,
+            None => {
+                for (x, out) in xs.clone().zip(out.chunks_exact_mut(groups * group)) {
+                    // The padding, and correspondences outside the right image.
+                    set_border_costs::<S, BLOCKS>(simd, frame, frame.inside(x), masks.hides_left(x), out);
+                    set_masked_costs(frame, &masks, x, out);
+                }
+                return;
+            }
+        }
+    }
+    let [left_columns, right_columns] = columns;
     // Only pixels near the ends of a row have correspondences outside the right image.
-    let all = |x: usize| frame.inside(x).len() == frame.disparities;
+    let inside = |x: usize| {
+        if left_columns.contains(&x) { frame.inside_columns(x, &right_columns) } else { 0..0 }
+    };
+    let all = |x: usize| inside(x).len() == frame.disparities;
     let (first, last) = (xs.start, xs.end);
     let border = |x: &usize| !all(*x);
     let left = xs.clone().take_while(border).count();
@@ -146,7 +181,7 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
     let (middle, out_right) = rest.split_at_mut((count - left - right) * groups * group);
     let ends = [(first..first + left, out_left), (last - right..last, out_right)];
     for (x, out) in ends.into_iter().flat_map(|(xs, out)| xs.zip(out.chunks_exact_mut(groups * group))) {
-        set_border_costs::<S, BLOCKS>(simd, frame, frame.inside(x), out);
+        set_border_costs::<S, BLOCKS>(simd, frame, inside(x), !left_columns.contains(&x), out);
     }
     if frame.disparities < groups * group {
         // Not `for_each`, which is not compiled for the instruction set: its SIMD operations would be function calls.
@@ -173,6 +208,29 @@ fn pad<S: Simd, const BLOCKS: usize>(simd: S, disparities: usize, out: &mut [u8]
     }
 }
 
+/// Sets the costs of correspondences without data, or outside the right image, of a pixel with data in a row that has pixels without data
+/// between others.
+fn set_masked_costs(frame: &Frame<'_>, masks: &RowMasks<'_>, x: usize, out: &mut [u8]) {
+    if masks.hides_left(x) {
+        return;
+    }
+    let inside = frame.inside(x);
+    let Layout { group, lanes, .. } = frame.layout;
+    let has_data = |k: &usize| {
+        let column = x as i64 - frame.min_disparity - *k as i64;
+        inside.contains(k) && !masks.hides_right(column as usize)
+    };
+    let (mut sum, mut count) = (0, 0);
+    for k in (0..frame.disparities).filter(has_data) {
+        sum += u32::from(out[place(k, group, lanes)]);
+        count += 1;
+    }
+    let outside = outside_cost(sum, count);
+    for k in (0..frame.disparities).filter(|k| !has_data(k)) {
+        out[place(k, group, lanes)] = outside;
+    }
+}
+
 /// Adds the cost of the distance from the prior of a pixel.
 #[inline(always)]
 fn add_prior<S: Simd, const BLOCKS: usize>(simd: S, prior: Prior, out: &mut [u8]) {
@@ -196,9 +254,15 @@ fn add_prior<S: Simd, const BLOCKS: usize>(simd: S, prior: Prior, out: &mut [u8]
     }
 }
 
-/// Sets the costs of correspondences outside the right image, and of the padding.
+/// Sets the costs of correspondences outside the right image, and of the padding; all of a pixel without data.
 #[inline(always)]
-fn set_border_costs<S: Simd, const BLOCKS: usize>(simd: S, frame: &Frame<'_>, inside: Range<usize>, out: &mut [u8]) {
+fn set_border_costs<S: Simd, const BLOCKS: usize>(
+    simd: S,
+    frame: &Frame<'_>,
+    inside: Range<usize>,
+    is_masked: bool,
+    out: &mut [u8],
+) {
     let lanes = S::u8s::LEN;
     let group = BLOCKS * BLOCK;
     let n = group / lanes;
@@ -219,7 +283,9 @@ fn set_border_costs<S: Simd, const BLOCKS: usize>(simd: S, frame: &Frame<'_>, in
         // At most 128 times 254.
         sum += u32::from(part.reduce_sum());
     }
-    let outside = S::u8s::splat(simd, outside_cost(sum, inside.len()));
+    let inside = if is_masked { 0..0 } else { inside };
+    let outside = if is_masked { frame.masked_cost() } else { outside_cost(sum, inside.len()) };
+    let outside = S::u8s::splat(simd, outside);
     let worst = S::u8s::splat(simd, u8::MAX);
     for (g, out) in out.chunks_exact_mut(group).enumerate() {
         let (low, high) = (local(inside.start, g), local(inside.end, g));
@@ -239,6 +305,8 @@ pub(crate) struct Penalties {
     table: [u8; 256],
     /// The differences at which it decreases by one; repeated for larger decreases.
     steps: Vec<u8>,
+    /// The largest of the table.
+    largest: u8,
 }
 
 impl Penalties {
@@ -246,7 +314,7 @@ impl Penalties {
         let table = crate::winner::p2_table(options).map(|p2| p2 - options.p1);
         let falls = |step: &u8| usize::from(table[usize::from(*step) - 1] - table[usize::from(*step)]);
         let steps = (1..=255u8).flat_map(|step| std::iter::repeat_n(step, falls(&step))).collect();
-        Self { table, steps }
+        Self { table, steps, largest: table[0] }
     }
 
     /// Computes P2 − P1 between the pixels of two rows.

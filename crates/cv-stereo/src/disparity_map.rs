@@ -13,8 +13,10 @@ pub enum PixelState {
     Occluded,
     /// The match failed a check, or smoothing moved a depth discontinuity across the pixel. Filled from the surrounding surfaces.
     Mismatched,
-    /// Out of view: the correspondence would be outside the right image. Filled from the surrounding surfaces.
+    /// Out of view: the correspondence would be outside the right image, or in its black border. Filled from the surrounding surfaces.
     OutOfView,
+    /// The left image has no data: the black border of a rectified image. Never filled.
+    NoData,
 }
 
 impl Sample for PixelState {}
@@ -24,7 +26,8 @@ impl Sample for PixelState {}
 pub struct DisparityMap {
     /// `x_left − x_right` in px, NaN where unknown.
     pub disparity: GrayF32,
-    /// Where each disparity comes from; all but [`PixelState::Matched`] are filled, or NaN without filling.
+    /// Where each disparity comes from; all but [`PixelState::Matched`] are filled, or NaN without filling, and NaN for
+    /// [`PixelState::NoData`].
     pub state: Image<PixelState, 1>,
 }
 
@@ -41,15 +44,27 @@ impl DisparityMap {
         }
     }
 
-    /// Fraction of pixels with a disparity, filled ones included.
+    /// Fraction of the pixels with data that have a disparity, filled ones included.
     pub fn valid_fraction(&self) -> f64 {
-        let d = self.disparity.as_slice();
-        d.iter().filter(|v| v.is_finite()).count() as f64 / d.len().max(1) as f64
+        let count = self.disparity.as_slice().iter().filter(|v| v.is_finite()).count();
+        count as f64 / self.data_pixels().max(1) as f64
     }
 
-    /// Fraction of pixels that were matched and accepted by every check.
+    /// Fraction of the pixels with data that were matched and accepted by every check.
     pub fn matched_fraction(&self) -> f64 {
-        let s = self.state.as_slice();
-        s.iter().filter(|&&v| v == PixelState::Matched).count() as f64 / s.len().max(1) as f64
+        self.count(PixelState::Matched) as f64 / self.data_pixels().max(1) as f64
+    }
+
+    /// Fraction of all pixels that have no data ([`PixelState::NoData`]).
+    pub fn no_data_fraction(&self) -> f64 {
+        self.count(PixelState::NoData) as f64 / self.state.as_slice().len().max(1) as f64
+    }
+
+    fn data_pixels(&self) -> usize {
+        self.state.as_slice().len() - self.count(PixelState::NoData)
+    }
+
+    fn count(&self, state: PixelState) -> usize {
+        self.state.as_slice().iter().filter(|&&v| v == state).count()
     }
 }

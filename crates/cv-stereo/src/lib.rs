@@ -19,6 +19,7 @@
 //! Disparity is `x_left − x_right` in pixels, `f32`, NaN where unknown.
 
 mod aligned_buffer;
+mod border_mask;
 mod buffer_pool;
 mod census;
 mod coarse_prior;
@@ -49,6 +50,7 @@ mod rectify_scene;
 mod reference;
 mod search_window;
 mod select;
+mod sequence;
 mod sgm;
 mod speckle;
 mod surface_filling;

@@ -1,5 +1,6 @@
 //! The semi-global matcher: from a rectified pair to checked disparities.
 
+use crate::border_mask::Borders;
 use crate::census::{Gray, describe, describe_mirrored, planes};
 use crate::coarse_prior::{Prior, classify_texture, set_priors};
 use crate::confidence::{confidence, sigma};
@@ -11,13 +12,14 @@ use crate::layout::Layout;
 use crate::local_expansion;
 use crate::matcher_memory::STRIP_OVERLAP;
 use crate::search_window::SearchWindows;
+use crate::sequence;
 use crate::sgm::Aggregator;
 use crate::speckle::{Speckles, remove_speckles};
 use crate::surface_filling::{self, Filling, Pair, fill};
 use crate::winner::Winner;
 use crate::winner_checks::check_row;
 use crate::{Intensity, IntensityCost, Paths, Search, Smoothing, StereoError, StereoOptions, median, window_sweep};
-use cv_core::{Cancelled, GrayF32, ImageView, Progress, Stage, StageClock};
+use cv_core::{Cancelled, GrayF32, ImageView, Mask, Progress, Stage, StageClock};
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 use std::ops::Range;
@@ -58,6 +60,7 @@ pub struct StereoMatcher {
     level: Level,
     gray: [Gray; 2],
     gray8: Vec<u8>,
+    borders: Borders,
     /// Census bits and values of the intensity cost, of both views.
     described: [Vec<u8>; 2],
     aggregator: Aggregator,
@@ -66,6 +69,8 @@ pub struct StereoMatcher {
     speckles: Speckles,
     filling: Filling,
     scratch: Vec<f32>,
+    /// The previous frame of both views.
+    frames: [sequence::View; 2],
     smoothing: SmoothingBuffers,
     /// Buffers of the threads of hierarchical matching.
     window_sweeps: Vec<window_sweep::Buffers>,
@@ -97,12 +102,14 @@ impl StereoMatcher {
             level: Level::new(),
             gray: Default::default(),
             gray8: Vec::new(),
+            borders: Borders::default(),
             described: Default::default(),
             aggregator: Aggregator::default(),
             strip: Aggregator::default(),
             speckles: Speckles::default(),
             filling: Filling::default(),
             scratch: Vec::new(),
+            frames: Default::default(),
             smoothing: SmoothingBuffers::default(),
             window_sweeps: Vec::new(),
             priors: Vec::new(),
@@ -115,6 +122,12 @@ impl StereoMatcher {
     /// Returns the options.
     pub fn options(&self) -> &StereoOptions {
         &self.options
+    }
+
+    /// Sets the pixels of the left and the right image that have data ([`crate::RectifiedView::apply`]), for all following pairs of this
+    /// size; `None` detects black borders, as [`StereoOptions::ignore_black_borders`] says.
+    pub fn set_masks(&mut self, masks: Option<[&Mask; 2]>) {
+        self.borders.set_given(masks);
     }
 
     /// Computes the disparities of `left`. The images are rectified: a scene point has the same y in both.
@@ -155,8 +168,19 @@ impl StereoMatcher {
                 return Err(StereoError::NotFinite { side, count });
             }
         }
+        self.borders.update(&mut self.gray, self.options.ignore_black_borders, &mut self.scratch);
+        if self.options.sequence {
+            for (frame, gray) in self.frames.iter_mut().zip(&mut self.gray) {
+                frame.filter(gray);
+            }
+        }
         clock.lap("gray");
         self.compute_gray(map, clock, progress)
+    }
+
+    /// Forgets the previous frame of a sequence.
+    pub fn forget_frame(&mut self) {
+        self.frames.iter_mut().for_each(sequence::View::forget);
     }
 
     /// As [`StereoMatcher::compute_into`], of the gray levels in `self.gray`.
@@ -278,6 +302,7 @@ impl StereoMatcher {
             speckle_size: self.options.speckle_size / 4,
             confidence: false,
             quality: false,
+            sequence: false,
             ..self.options.clone()
         };
         let options = if is_hierarchical {
@@ -318,6 +343,7 @@ impl StereoMatcher {
         for (small, large) in matcher.gray.iter_mut().zip(&self.gray) {
             small.halve(large);
         }
+        matcher.borders = self.borders.halved();
         matcher.compute_gray(map, StageClock::new(), progress)?;
         let range = (self.options.min_disparity, self.options.disparities);
         if is_hierarchical {
@@ -357,6 +383,7 @@ impl StereoMatcher {
             right: &self.described[1][rows.start * stride..rows.end * stride],
             given: None,
             priors: self.priors.get(rows.start * width..rows.end * width).unwrap_or(&[]),
+            masks: self.borders.masks(rows.start),
             intensity_cap: (options.intensity_cost != IntensityCost::None).then(|| options.intensity_cost.cap()),
             gray: &self.gray8[rows.start * width..rows.end * width],
             p1: options.p1,
@@ -394,14 +421,19 @@ impl StereoMatcher {
     /// Checks the winners (uniqueness, field of view, left-right consistency) and refines those that pass to sub-pixel accuracy.
     fn check(&self, map: &mut DisparityMap) {
         let width = map.disparity.width();
+        let masks = self.borders.masks(0);
         let Aggregator { winners, right, .. } = &self.aggregator;
         map.disparity
             .as_mut_slice()
             .par_chunks_mut(width)
             .zip(map.state.as_mut_slice().par_chunks_mut(width))
             .zip(winners.par_chunks(width).zip(right.par_chunks(width)))
-            .for_each(|((disparity, state), (winners, right))| {
+            .enumerate()
+            .for_each(|(y, ((disparity, state), (winners, right)))| {
                 dispatch!(self.level, simd => check_row(simd, &self.options, winners, right, state, disparity));
+                if let Some(masks) = masks.row(y) {
+                    masks.check(self.options.min_disparity, winners, state, disparity);
+                }
             });
     }
 
@@ -410,6 +442,7 @@ impl StereoMatcher {
         let stage = Stage::new(progress, "refine", 4)?;
         let width = map.disparity.width();
         let options = &self.options;
+        let masks = self.borders.masks(0);
         let (disparity, states) = (map.disparity.as_mut_slice(), map.state.as_mut_slice());
         remove_speckles(disparity, states, width, options.speckle_size, options.speckle_range, &mut self.speckles);
         stage.add(1)?;
@@ -423,12 +456,16 @@ impl StereoMatcher {
                 planes: planes(options.census, options.intensity_cost),
                 bits: options.census.bits(),
                 layout: self.layout(width, self.gray[0].height),
+                masks,
             };
             // One buffer for both: neither is used in the other's stage.
             std::mem::swap(&mut self.filling.right, &mut self.scratch);
             let filled = fill(self.level, disparity, states, pair, &mut self.filling, &stage);
             std::mem::swap(&mut self.filling.right, &mut self.scratch);
             filled?;
+            if !options.quality {
+                self.borders.clear(disparity, states);
+            }
             stage.add(1)?;
         }
         if options.median > 0 {
@@ -447,8 +484,9 @@ impl StereoMatcher {
             let range = (first, first + (options.disparities - 1) as f32);
             let gray = [&self.gray[0], &self.gray[1]];
             local_expansion::expand(self.level, gray, range, disparity, states, progress)?;
-            surface_filling::classify_unmatched(disparity, states, width, &mut self.filling);
+            surface_filling::classify_unmatched(disparity, states, width, masks, &mut self.filling);
         }
+        self.borders.clear(disparity, states);
         if options.quality && !options.fill {
             let unknown = disparity.iter_mut().zip(states).filter(|(_, state)| **state != PixelState::Matched);
             unknown.for_each(|(d, _)| *d = f32::NAN);

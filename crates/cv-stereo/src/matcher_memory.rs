@@ -44,6 +44,8 @@ impl StereoMatcher {
         let whole = if rows < height { 0 } else { height };
         // Gray of both views in 16 bits, of one in 8; winners of both views; labels, scratch and outputs.
         let fixed = 5 + planes + size_of::<Winner>() + size_of::<u16>() + 8 + 4 + 5 + size_of::<Prior>();
+        // The previous frame of both views.
+        let fixed = fixed + if options.sequence { 2 * size_of::<u16>() } else { 0 };
         let layout = self.layout(width, height);
         let stride = layout.right_row(width);
         let aggregation = if self.is_hierarchical(width, height) {

@@ -204,10 +204,18 @@ pub struct StereoOptions {
     pub smoothing: Smoothing,
     /// Whether rejected pixels are filled from the surrounding surfaces, as [`crate::PixelState`] says by which cause. Default true.
     pub fill: bool,
+    /// Whether the black borders of rectified images are left out: regions of exactly 0 in all channels in a corner of the image
+    /// (0.5 % of it or more) or along 0.4 of a side (0.1 % or more), with a smooth outline. Their pixels are [`crate::PixelState::NoData`]. Default true. Masks
+    /// ([`crate::StereoMatcher::set_masks`]) take precedence.
+    pub ignore_black_borders: bool,
     /// Quality mode: local expansion moves over slanted planes (Taniai et al., PAMI 2018) after semi-global matching. Takes about fifty times
     /// as long (8 to 14 µs of one core per pixel) and leaves two thirds of the errors above 2 px (Middlebury 2014, quarter size), on roads
     /// half. Default false.
     pub quality: bool,
+    /// Whether the pairs are consecutive frames: noise is averaged over time where an image does not change, so that disparities of still
+    /// cameras flicker half as much. Nothing is averaged where an object moved, while the camera moves, and over a cut
+    /// ([`crate::StereoMatcher::forget_frame`] starts anew). Default false.
+    pub sequence: bool,
     /// Whether [`crate::StereoMatcher::confidence`] is computed: the second best match takes a tenth of the time. Default false.
     pub confidence: bool,
     /// Maximum number of bytes of the matcher; `None` sets no limit. If the whole image does not fit, costs are aggregated in strips of rows
@@ -238,7 +246,9 @@ impl Default for StereoOptions {
             median: 1,
             smoothing: Smoothing::Bilateral { sigma: 24.0 },
             fill: true,
+            ignore_black_borders: true,
             quality: false,
+            sequence: false,
             confidence: false,
             max_memory: None,
         }

@@ -1,6 +1,7 @@
 //! Aggregation of given costs, without computing costs or selecting winners, for benchmarks.
 
 use crate::aligned_buffer::AlignedBuffer;
+use crate::border_mask::PairMasks;
 use crate::cost::{Frame, Penalties};
 use crate::kernel::{Output, Sweep};
 use crate::layout::{Layout, place};
@@ -91,6 +92,7 @@ impl PathSums {
             left: &[],
             right: &[],
             priors: &[],
+            masks: PairMasks::default(),
             given: Some(self.costs.as_mut_slice()),
             intensity_cap: None,
             gray: &self.gray,

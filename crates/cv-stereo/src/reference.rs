@@ -1,5 +1,6 @@
 //! Reference implementation of semi-global matching with whole cost volumes, which the fast matcher must equal.
 
+use crate::border_mask::PairMasks;
 use crate::coarse_prior::Prior;
 use crate::winner::{NO_SUM, Winner, outside_cost, p2_table};
 use crate::{IntensityCost, Paths, StereoOptions};
@@ -11,13 +12,14 @@ pub(crate) fn match_reference(
     [left, right]: [&[u64]; 2],
     intensity_cost: &[Vec<u8>; 2],
     priors: &[Prior],
-    width: usize,
-    height: usize,
+    masks: PairMasks<'_>,
+    (width, height): (usize, usize),
 ) -> (Vec<Winner>, Vec<u16>) {
     let n = options.disparities;
-    let column = |x: usize, k: usize| {
+    let column = |x: usize, y: usize, k: usize| {
         let xr = x as i64 - i64::from(options.min_disparity) - k as i64;
-        usize::try_from(xr).ok().filter(|&xr| xr < width)
+        let has_data = |xr: &usize| !masks.row(y).is_some_and(|row| row.hides_right(*xr));
+        usize::try_from(xr).ok().filter(|&xr| xr < width).filter(has_data)
     };
     let bits = |i: usize, j: usize| {
         let more = if options.intensity_cost == IntensityCost::None {
@@ -35,12 +37,15 @@ pub(crate) fn match_reference(
     };
     let costs: Vec<u8> = (0..width * height)
         .flat_map(|i| {
-            let (x, row) = (i % width, i / width * width);
+            let (x, y, row) = (i % width, i / width, i / width * width);
+            if masks.row(y).is_some_and(|row| row.hides_left(x)) {
+                return vec![254 - options.p2; n];
+            }
             let inside: Vec<Option<u8>> =
-                (0..n).map(|k| column(x, k).map(|xr| bits(i, row + xr) + prior_cost(i, k))).collect();
+                (0..n).map(|k| column(x, y, k).map(|xr| bits(i, row + xr) + prior_cost(i, k))).collect();
             let known = inside.iter().flatten();
             let outside = outside_cost(known.clone().map(|&c| u32::from(c)).sum(), known.count());
-            inside.into_iter().map(move |cost| cost.unwrap_or(outside)).collect::<Vec<_>>()
+            inside.into_iter().map(move |cost| cost.unwrap_or(outside)).collect()
         })
         .collect();
     let cost = |x: usize, y: usize, k: usize| u32::from(costs[(y * width + x) * n + k]);
@@ -122,12 +127,14 @@ pub(crate) fn match_reference(
 
 mod tests {
     use super::*;
+    use crate::border_mask::BorderMask;
     use crate::census::{Gray, MARGIN, describe, describe_mirrored, planes};
     use crate::cost::{Frame, Penalties};
     use crate::layout::Layout;
     use crate::search_window::{SearchWindows, WINDOW};
     use crate::sgm::Aggregator;
     use crate::{Census, StereoOptions, window_sweep};
+    use cv_core::Mask;
     use cv_synth::instruction_sets;
     use fearless_simd::Level;
     use proptest::prelude::*;
@@ -190,18 +197,26 @@ mod tests {
         options: &'a StereoOptions,
         gray: [Gray; 2],
         priors: &'a [Prior],
+        masks: PairMasks<'a>,
         p2: Penalties,
         expected: (Vec<Winner>, Vec<u16>),
     }
 
     impl<'a> Pair<'a> {
-        fn new(options: &'a StereoOptions, images: &[Vec<u16>; 2], width: usize, priors: &'a [Prior]) -> Self {
+        fn new(
+            options: &'a StereoOptions,
+            images: &[Vec<u16>; 2],
+            width: usize,
+            priors: &'a [Prior],
+            masks: PairMasks<'a>,
+        ) -> Self {
             let height = images[0].len() / width;
             let bits = images.each_ref().map(|g| census_reference(g, width, height, options.census));
             let values = images.each_ref().map(|g| intensity_reference(g, width, options.intensity_cost));
-            let expected = match_reference(options, &images[0], [&bits[0], &bits[1]], &values, priors, width, height);
+            let bits = [&bits[0][..], &bits[1][..]];
+            let expected = match_reference(options, &images[0], bits, &values, priors, masks, (width, height));
             let gray = images.each_ref().map(|g| padded(g, width, height));
-            Self { options, gray, priors, p2: Penalties::new(options), expected }
+            Self { options, gray, priors, masks, p2: Penalties::new(options), expected }
         }
 
         /// Calls `f` with the frame of the fast matcher on an instruction set.
@@ -225,12 +240,24 @@ mod tests {
                 gray: &gray,
                 given: None,
                 priors: self.priors,
+                masks: self.masks,
                 intensity_cap: (intensity_cost != IntensityCost::None).then_some(intensity_cost.cap()),
                 p1,
                 p2: &self.p2,
                 second: confidence,
             });
         }
+    }
+
+    /// Borders of random widths, and holes in some rows.
+    fn masks(width: usize, height: usize, has_masks: bool, noise: impl Fn(usize) -> u16) -> Option<BorderMask> {
+        let at = |i: usize, n: usize| usize::from(noise(i)) * 31 % n;
+        let has_data = |x: usize, y: usize| {
+            let is_hole = at(3 * y + 5, 3) == 0 && (x / 3 + y) % 5 == 2;
+            x >= at(3 * y, width) / 2 && x < width - at(3 * y + 1, width) / 2 && !is_hole
+        };
+        let valid = Mask::from_fn(width, height, |x, y| [has_data(x, y)]);
+        BorderMask::from_valid(&valid).filter(|_| has_masks)
     }
 
     fn options() -> impl Strategy<Value = StereoOptions> {
@@ -268,6 +295,7 @@ mod tests {
             height in 7usize..16,
             seed in any::<u64>(),
             has_priors in any::<bool>(),
+            has_masks in any::<bool>(),
             levels_of_gray in prop_oneof![Just(2u16), Just(5), Just(200)],
         ) {
             options.validate().unwrap();
@@ -281,7 +309,9 @@ mod tests {
             let right: Vec<u16> = (0..width * height).map(|i| noise(if i % 5 == 0 { i + 7 } else { i + 3 })).collect();
             let prior = |i: usize| Prior::new((noise(i + 11) as usize * 31 % options.disparities) as u16, (noise(i + 5) % 4) as u8);
             let priors: Vec<Prior> = if has_priors { (0..width * height).map(prior).collect() } else { Vec::new() };
-            let pair = Pair::new(&options, &[left, right], width, &priors);
+            let borders = [0, 77].map(|salt| masks(width, height, has_masks, |i| noise(i + salt)));
+            let masks = PairMasks { left: borders[0].as_ref(), right: borders[1].as_ref(), first: 0 };
+            let pair = Pair::new(&options, &[left, right], width, &priors, masks);
             for level in instruction_sets() {
                 let mut aggregator = Aggregator::default();
                 pair.with_frame(level, Layout::new(level, options.disparities), |frame| {
@@ -302,13 +332,16 @@ mod tests {
             width in 9usize..90,
             height in 7usize..16,
             seed in any::<u64>(),
+            has_masks in any::<bool>(),
         ) {
             let options = StereoOptions { disparities: WINDOW, paths: Paths::Four, ..options };
             let noise = |i: usize| ((seed.wrapping_add(i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40) as u16 % 5) * 13_107;
             let left: Vec<u16> = (0..width * height).map(noise).collect();
             let right: Vec<u16> = (0..width * height).map(|i| noise(i + 3)).collect();
             let priors: Vec<Prior> = (0..width * height).map(|i| Prior::new(noise(i + 11) % 32, (noise(i + 5) % 4) as u8)).collect();
-            let pair = Pair::new(&options, &[left, right], width, &priors);
+            let borders = [0, 77].map(|salt| masks(width, height, has_masks, |i| noise(i + salt)));
+            let masks = PairMasks { left: borders[0].as_ref(), right: borders[1].as_ref(), first: 0 };
+            let pair = Pair::new(&options, &[left, right], width, &priors, masks);
             let mut windows = SearchWindows::default();
             for level in instruction_sets() {
                 windows.set(level, &vec![5.0; (width / 2) * (height / 2)], width / 2, (options.min_disparity, options.disparities));

@@ -8,6 +8,7 @@
 //! "PatchMatch stereo", BMVC 2011).
 
 use crate::PixelState;
+use crate::border_mask::PairMasks;
 use crate::fill_uncertainty::Extrapolation;
 use crate::layout::Layout;
 use crate::surfaces::{CELL, NONE, Plane, Surfaces, center, extent, neighbors};
@@ -65,13 +66,15 @@ pub(crate) struct Pair<'a> {
     pub(crate) planes: usize,
     pub(crate) bits: usize,
     pub(crate) layout: Layout,
+    /// Pixels without data.
+    pub(crate) masks: PairMasks<'a>,
 }
 
 /// Buffers of [`fill`], reused between frames.
 #[derive(Debug, Default)]
 pub(crate) struct Filling {
     surfaces: Surfaces,
-    /// Disparity of the nearest match of each pixel of the right image, −∞ without any.
+    /// Disparity of the nearest match of each pixel of the right image, −∞ without any, +∞ without data.
     pub(crate) right: Vec<f32>,
     /// Cells without an initial surface.
     open: Vec<u32>,
@@ -103,7 +106,7 @@ pub(crate) fn fill(
     if surfaces.planes.is_empty() {
         return Ok(());
     }
-    project_matches(disparity, states, width, right);
+    project_matches(disparity, states, width, pair.masks, right);
     surfaces.smooth_low_texture(disparity, width);
     stage.check()?;
     let view = View { pair, right, disparity, states, columns: RightColumns::new(&pair) };
@@ -162,8 +165,14 @@ impl Filling {
 }
 
 /// Sets the states of unmatched pixels by their current disparities.
-pub(crate) fn classify_unmatched(disparity: &[f32], states: &mut [PixelState], width: usize, filling: &mut Filling) {
-    project_matches(disparity, states, width, &mut filling.right);
+pub(crate) fn classify_unmatched(
+    disparity: &[f32],
+    states: &mut [PixelState],
+    width: usize,
+    masks: PairMasks<'_>,
+    filling: &mut Filling,
+) {
+    project_matches(disparity, states, width, masks, &mut filling.right);
     let rows = disparity.par_chunks(width).zip(filling.right.par_chunks(width));
     states.par_chunks_mut(width).zip(rows).for_each(|(states, (disparity, right))| {
         for (x, (state, d)) in states.iter_mut().zip(disparity).enumerate() {
@@ -177,7 +186,7 @@ pub(crate) fn classify_unmatched(disparity: &[f32], states: &mut [PixelState], w
 /// Returns the state of an unmatched pixel by its disparity and the matches of the right image in its row.
 fn unmatched_state(x: usize, d: f32, right: &[f32]) -> PixelState {
     let column = x as f32 - d + 0.5;
-    if !(column >= 0.0 && column < right.len() as f32) {
+    if !(column >= 0.0 && column < right.len() as f32) || right[column as usize] == f32::INFINITY {
         PixelState::OutOfView
     } else if right[column as usize] > d + 1.0 {
         PixelState::Occluded
@@ -187,10 +196,10 @@ fn unmatched_state(x: usize, d: f32, right: &[f32]) -> PixelState {
 }
 
 /// Projects the matches to the right image: the nearest at each pixel.
-fn project_matches(disparity: &[f32], states: &[PixelState], width: usize, right: &mut Vec<f32>) {
+fn project_matches(disparity: &[f32], states: &[PixelState], width: usize, masks: PairMasks<'_>, right: &mut Vec<f32>) {
     right.resize(disparity.len(), f32::NEG_INFINITY);
     let rows = disparity.par_chunks(width).zip(states.par_chunks(width));
-    right.par_chunks_mut(width).zip(rows).for_each(|(right, (disparity, states))| {
+    right.par_chunks_mut(width).zip(rows).enumerate().for_each(|(y, (right, (disparity, states)))| {
         right.fill(f32::NEG_INFINITY);
         for (x, (&d, &state)) in disparity.iter().zip(states).enumerate() {
             // Rounded to the nearest column. NaN compares false.
@@ -200,6 +209,7 @@ fn project_matches(disparity: &[f32], states: &[PixelState], width: usize, right
                 *nearest = if d > *nearest { d } else { *nearest };
             }
         }
+        masks.row(y).iter().for_each(|masks| masks.fill_right(right, f32::INFINITY));
     });
 }
 
@@ -273,7 +283,7 @@ impl View<'_> {
             return OCCLUDING_COST;
         }
         if d < visible - 1.0 {
-            return OCCLUDED_COST;
+            return if visible == f32::INFINITY { OUT_OF_VIEW_COST } else { OCCLUDED_COST };
         }
         let RightColumns { bytes, row, phase, .. } = self.columns;
         let Some(place) = self.columns.place(column, planes) else { return OUT_OF_VIEW_COST };
@@ -297,7 +307,7 @@ impl View<'_> {
                 let weight = (step * step) as f32;
                 if d.is_nan() {
                     cost += 0.25 * weight * OCCLUDING_COST * self.cost(x, y, value, texture, self.bits(x, y));
-                    if self.states[i] != PixelState::OutOfView {
+                    if !matches!(self.states[i], PixelState::OutOfView | PixelState::NoData) {
                         let rejected = (self.pair.min_disparity + i32::from(self.pair.winners[i].index)) as f32;
                         cost += weight * REJECTED_WEIGHT * (rejected - value).abs().min(2.0);
                     }

@@ -1,5 +1,6 @@
 //! Jobs on generated scenes against ground truth. One binary: each further one takes as long to compile as its tests run.
 
+mod borders;
 mod dense;
 mod filled;
 mod flat_map;
@@ -7,6 +8,7 @@ mod generated;
 mod panorama;
 mod reconstruct;
 mod refusals;
+mod sequence;
 mod serde;
 mod stereo;
 mod tracks;

@@ -51,6 +51,9 @@ impl Args {
                 seconds += start.elapsed().as_secs_f64();
                 one.write(&job, sequence.meters_per_unit, context)?;
                 let fractions = (job.maps.map.matched_fraction(), job.maps.map.valid_fraction());
+                if frames.is_empty() {
+                    super::report_border(&job.maps.map, context);
+                }
                 if context.wants_report() && first.is_none() {
                     first = Some(job);
                 }
@@ -60,6 +63,9 @@ impl Args {
                 let map = map.map_err(failure).during(left.display())?;
                 seconds += start.elapsed().as_secs_f64();
                 one.write_disparity(map, context)?;
+                if frames.is_empty() {
+                    super::report_border(map, context);
+                }
                 (map.matched_fraction(), map.valid_fraction())
             };
             if frames.is_empty() {

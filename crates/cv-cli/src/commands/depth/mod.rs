@@ -31,14 +31,14 @@ pub(crate) use report::{fractions, scene};
 ///
 /// Without --rig the pair must be rectified: corresponding points lie in the same row. Disparity is the column in the
 /// left image minus the column in the right one. Occluded and mismatched pixels are filled from their surroundings
-/// unless --no-fill is given.
+/// unless --no-fill is given. The black borders of rectified images have no disparity.
 #[derive(Debug, Clone, clap::Args)]
 #[command(after_help = "Examples:\n  \
     cv depth left.png right.png -o disparity.pfm\n  \
     cv depth left.png right.png -o d.pfm --focal 1000 --baseline 0.12 --depth depth.pfm --cloud cloud.ply\n  \
     cv depth left.png right.png --disparities auto -o disparity.npy\n  \
     cv depth left.png right.png --quality -o disparity.pfm\n  \
-    cv depth left right -o disparities\n  \
+    cv depth left right --sequence -o disparities\n  \
     cv depth left.jpg right.jpg --rig rig.yaml -o disparity.png --depth depth.png --report out\n\n\
     The extension selects the format: .pfm (floats, invalid +inf), .npy (floats, invalid NaN), .png (disparity as KITTI's\n\
     16-bit PNG, 256 steps a pixel; depth as 16-bit millimeters, if the baseline is in meters or the rig file has its unit; invalid 0).")]
@@ -57,6 +57,10 @@ pub(crate) struct Args {
     /// How frames are paired [default: by name if the names are the same, else by number]. Unpaired frames are refused.
     #[arg(long, value_name = "HOW", value_parser = named::<PairBy>())]
     pair_by: Option<PairBy>,
+    /// The frames are consecutive: average noise over time where the images do not change, so that disparities flicker half as much. Objects that move leave no trail; while
+    /// the camera moves, nothing is averaged.
+    #[arg(long)]
+    sequence: bool,
     /// Where to write the depth, in the unit of the baseline: .pfm, .png or .npy. Needs --rig, or --focal and --baseline.
     #[arg(long, value_name = "FILE")]
     depth: Option<PathBuf>,
@@ -202,6 +206,10 @@ impl Run for Args {
         if self.pair_by.is_some() {
             return Err(Failure::usage("--pair-by applies to sequences of frames, not to a single pair"));
         }
+        if self.sequence {
+            return Err(Failure::usage("--sequence applies to frames, not to a single pair")
+                .advice("give two folders or patterns of frames"));
+        }
         let photos = Photos::read(&self.left, &self.right)?;
         let mut sequence = self.sequence(&photos, [&self.left, &self.right], context)?;
         let points = self.wants_points(context);
@@ -215,6 +223,7 @@ impl Run for Args {
             warn_of_alignment(offset, context);
         }
         warn_of_filling(&job.maps, context);
+        report_border(map, context);
         context.report(|| report::report(&job, &[]))?;
         let (width, height) = map.disparity.size();
         Ok(Outcome::new(job.maps.stages.clone())
@@ -222,6 +231,7 @@ impl Run for Args {
             .with("height", height)
             .with("valid_fraction", valid)
             .with("matched_fraction", matched)
+            .with("no_data_fraction", map.no_data_fraction())
             .with("disparities", disparities.1)
             .with("min_disparity", disparities.0)
             .with(
@@ -245,6 +255,17 @@ fn warn_of_alignment(offset: &VerticalOffset, context: &Context) {
         offset.across,
         offset.down
     ));
+}
+
+/// Reports the black border of the left image.
+fn report_border(map: &DisparityMap, context: &Context) {
+    let fraction = map.no_data_fraction();
+    if fraction > 0.0 {
+        context.note(format!(
+            "{:.1} % of the left image is a black border of rectification: it has no disparity, and the other fractions are of the rest",
+            100.0 * fraction
+        ));
+    }
 }
 
 /// Warns if few pixels were matched, and if most of the map is filled.

@@ -37,6 +37,7 @@ impl Args {
                 speckle_size: self.speckle_size,
                 fill: !self.no_fill,
                 quality: self.quality,
+                sequence: self.sequence,
                 intensity_cost: self.blend,
                 smoothing: match self.smoothing {
                     Smoothing::None => Smoothing::None,

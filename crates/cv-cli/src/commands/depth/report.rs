@@ -13,7 +13,7 @@ fn draw_states(left: ImageView<'_, u8, 3>, states: ImageView<'_, PixelState, 1>)
     RgbU8::from_fn(states.width(), states.height(), |x, y| {
         let pixel = left.at(x, y);
         let tint = match states.at(x, y)[0] {
-            PixelState::Matched => return pixel,
+            PixelState::Matched | PixelState::NoData => return pixel,
             PixelState::Occluded => [60u8, 110, 255],
             PixelState::Mismatched => [255, 150, 40],
             PixelState::OutOfView => [200, 60, 220],
