@@ -67,8 +67,8 @@ fn maps(frames: &[Frame], sequence: bool) -> Vec<DisparityMap> {
 fn bad(map: &DisparityMap, frame: &Frame, is_in: impl Fn(usize, usize) -> bool) -> f64 {
     let pixels: Vec<usize> =
         (0..SIZE.0 * SIZE.1).filter(|&i| frame.visible[i] && is_in(i % SIZE.0, i / SIZE.0)).collect();
-    let is_wrong = |i: usize| !((map.disparity.as_slice()[i] - frame.truth.as_slice()[i]).abs() <= 2.0);
-    100.0 * pixels.iter().filter(|&&i| is_wrong(i)).count() as f64 / pixels.len() as f64
+    let is_right = |i: usize| (map.disparity.as_slice()[i] - frame.truth.as_slice()[i]).abs() <= 2.0;
+    100.0 * (1.0 - pixels.iter().filter(|&&i| is_right(i)).count() as f64 / pixels.len() as f64)
 }
 
 /// Returns the median of the standard deviations over time of the pixels that no object covers, from the third frame on.
