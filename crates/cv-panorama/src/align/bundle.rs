@@ -66,8 +66,27 @@ impl Lens {
     /// Undistorts a pixel to normalized coordinates; `None` outside the range of the distortion model.
     fn ray(&self, pixel: Vector2<f64>) -> Option<Point2<f64>> {
         let q = Point2::from(pixel / self.log_focal.exp());
-        let p = if self.k1 == 0.0 { q } else { self.distortion().undistort(q) };
+        let p = if self.k1 == 0.0 { q } else { self.undistort(q) };
         p.x.is_finite().then_some(p)
+    }
+
+    /// Solves for the radius by Newton's method; as [`Distortion::undistort`], in a fraction of the time.
+    fn undistort(&self, q: Point2<f64>) -> Point2<f64> {
+        let distorted = q.coords.norm();
+        let mut radius = distorted;
+        for _ in 0..MAX_NEWTON_STEPS {
+            let (square, slope) = (radius * radius, 1.0 + 3.0 * self.k1 * radius * radius);
+            let error = radius * (1.0 + self.k1 * square) - distorted;
+            if slope <= 0.0 {
+                break;
+            }
+            if error.abs() < NEWTON_TOLERANCE * (1.0 + distorted) {
+                return if distorted > 0.0 { q * (radius / distorted) } else { q };
+            }
+            radius -= error / slope;
+        }
+        // Near the limit of its range, or beyond.
+        self.distortion().undistort(q)
     }
 }
 
@@ -95,6 +114,10 @@ pub(crate) struct Problem<'a> {
     pub(crate) loss: RobustLoss,
 }
 
+/// Maximum number of Newton steps; ordinary lenses take three to five.
+const MAX_NEWTON_STEPS: usize = 10;
+/// Residual at which Newton's method stops, relative to the focal length.
+const NEWTON_TOLERANCE: f64 = 1e-13;
 /// Prior standard deviation of k1: ordinary lenses reach ±0.2, phone cameras with built-in correction ±0.03.
 const K1_SIGMA: f64 = 0.1;
 /// Residual, in pixels, of a point behind the camera or outside the range of the distortion model.

@@ -95,8 +95,8 @@ const RESPONSE_SIGMA: f64 = 1.0;
 /// Weight of these priors relative to the sum of the weights of all samples.
 const PRIOR_WEIGHT: f64 = 2e-3;
 
-/// Sparse row of the design matrix: indices of unknowns and their coefficients.
-type Terms = [(usize, f64); 4 + COEFFICIENT_COUNT];
+/// Unknowns of an equation: two gains, vignetting, response.
+const TERMS: usize = 4 + COEFFICIENT_COUNT;
 
 /// Which unknowns are estimated.
 #[derive(Clone, Copy)]
@@ -112,19 +112,18 @@ impl Unknowns {
         3 * self.photos + 2 + COEFFICIENT_COUNT
     }
 
-    fn terms(&self, s: &Sample, c: usize) -> Terms {
-        let n = 3 * self.photos;
+    /// Returns the coefficients of the gains of the first and the second photograph, of the vignetting, and of the response.
+    #[inline(always)]
+    fn terms(&self, s: &Sample, c: usize, basis: &[[f64; COEFFICIENT_COUNT]; 256]) -> [f64; TERMS] {
         let lens = if self.vignetting { 1.0 } else { 0.0 };
         let curve = if self.curve { 1.0 } else { 0.0 };
-        let [a, b] = s.levels.map(|l| Response::basis(f64::from(l[c]) / 255.0));
+        let [a, b] = s.levels.map(|l| &basis[usize::from(l[c])]);
         let [p, q] = s.radius;
-        std::array::from_fn(|k| match k {
-            0 => (3 * s.a + c, 1.0),
-            1 => (3 * s.b + c, -1.0),
-            2 => (n, lens * (p - q)),
-            3 => (n + 1, lens * (p * p - q * q)),
-            k => (n + k - 2, curve * (a[k - 4] - b[k - 4])),
-        })
+        let mut terms = [1.0, -1.0, lens * (p - q), lens * (p * p - q * q), 0.0, 0.0, 0.0];
+        for (term, (a, b)) in terms[4..].iter_mut().zip(a.iter().zip(b)) {
+            *term = curve * (a - b);
+        }
+        terms
     }
 }
 
@@ -269,6 +268,7 @@ fn max_gradient(piece: &Piece, x: usize, y: usize, color: [u8; 3]) -> Option<u8>
 fn solve(samples: &[Sample], unknowns: Unknowns, stage: &Stage<'_>) -> Result<DVector<f64>, Cancelled> {
     let n = unknowns.count();
     let gains = 3 * unknowns.photos;
+    let basis: [[f64; COEFFICIENT_COUNT]; 256] = std::array::from_fn(|v| Response::basis(v as f64 / 255.0));
     let srgb: Vec<f64> = (0..=255).map(|v| Response::srgb(f64::from(v) / 255.0)).collect();
     let mut solution = DVector::zeros(n);
     for round in 0..10 {
@@ -279,32 +279,48 @@ fn solve(samples: &[Sample], unknowns: Unknowns, stage: &Stage<'_>) -> Result<DV
         // The Cauchy scale shrinks from a wide initial value: exposures may differ by stops.
         let scale = (256.0 / f64::from(1 << round.min(8))).max(CAUCHY_SCALE);
         let mut total = 0.0;
-        for (i, s) in samples.iter().enumerate() {
-            if i % 4096 == 0 {
-                stage.check()?;
-            }
+        // All equations of two photographs and a channel have the same unknowns: their normal equations are summed apart.
+        for overlap in samples.chunk_by(|s, t| (s.a, s.b) == (t.a, t.b)) {
+            stage.check()?;
             for c in 0..3 {
-                let [a, b] = s.levels.map(|l| l[c]);
-                if a.min(b) < MIN_LEVEL || a.min(b) >= CLIPPED {
-                    continue;
-                }
-                let terms = unknowns.terms(s, c);
-                let d = srgb[usize::from(a)] - srgb[usize::from(b)];
-                let residual = d + terms.iter().map(|&(k, t)| t * solution[k]).sum::<f64>();
-                // A clipped level is a lower bound of the radiance.
-                if a >= CLIPPED && residual <= 0.0 || b >= CLIPPED && residual >= 0.0 {
-                    continue;
-                }
-                let level = NOISE_SIGMA.hypot(MISALIGNMENT_SIGMA_PX * s.slope);
-                let sigma = level * slopes[usize::from(a)].hypot(slopes[usize::from(b)]);
-                let weight = 1.0 / (sigma * sigma * (1.0 + (residual / (scale * sigma)).powi(2)));
-                total += weight;
-                for &(k, t) in &terms {
-                    right[k] -= weight * t * d;
-                    for &(l, u) in &terms {
-                        normal[(k, l)] += weight * t * u;
+                let indices: [usize; TERMS] = std::array::from_fn(|k| match k {
+                    0 => 3 * overlap[0].a + c,
+                    1 => 3 * overlap[0].b + c,
+                    k => gains + k - 2,
+                });
+                let known: [f64; TERMS] = indices.map(|k| solution[k]);
+                let (mut products, mut sums) = ([[0.0; TERMS]; TERMS], [0.0; TERMS]);
+                for s in overlap {
+                    let [a, b] = s.levels.map(|l| l[c]);
+                    if a.min(b) < MIN_LEVEL || a.min(b) >= CLIPPED {
+                        continue;
+                    }
+                    let terms = unknowns.terms(s, c, &basis);
+                    let d = srgb[usize::from(a)] - srgb[usize::from(b)];
+                    let residual = d + terms.iter().zip(&known).map(|(t, x)| t * x).sum::<f64>();
+                    // A clipped level is a lower bound of the radiance.
+                    if a >= CLIPPED && residual <= 0.0 || b >= CLIPPED && residual >= 0.0 {
+                        continue;
+                    }
+                    let level = NOISE_SIGMA.powi(2) + (MISALIGNMENT_SIGMA_PX * s.slope).powi(2);
+                    let variance = level * (slopes[usize::from(a)].powi(2) + slopes[usize::from(b)].powi(2));
+                    // The Cauchy weight of the residual in standard deviations, over the variance.
+                    let weight = 1.0 / (variance + (residual / scale).powi(2));
+                    total += weight;
+                    for (k, products) in products.iter_mut().enumerate() {
+                        let weighted = weight * terms[k];
+                        sums[k] -= weighted * d;
+                        for (product, term) in products.iter_mut().zip(&terms) {
+                            *product += weighted * term;
+                        }
                     }
                 }
+                for (k, row) in indices.into_iter().zip(products) {
+                    for (l, product) in indices.into_iter().zip(row) {
+                        normal[(k, l)] += product;
+                    }
+                }
+                indices.into_iter().zip(sums).for_each(|(k, sum)| right[k] += sum);
             }
         }
         // Fixes the gauge (the common factor) only.

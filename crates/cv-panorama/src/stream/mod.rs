@@ -16,7 +16,8 @@ use crate::align::Alignment;
 use crate::bit_depth::PhotoSample;
 use crate::blend::NO_PHOTO;
 use crate::photometric::{Exposure, Gains, estimate_gains};
-use crate::render::{CompositingOptions, Drawing, PREVIEW_PIXELS, Panorama, RenderError, check, draw, regions};
+use crate::regions::regions;
+use crate::render::{CompositingOptions, Drawing, PREVIEW_PIXELS, Panorama, RenderError, check, draw};
 use crate::seams::{self, Seams};
 use crate::surface::{
     Bounds, Layout, PhotoMap, Preview, PreviewScale, ROUND_UNITS, WarpedPhoto, displacements_with, downsample_box,
@@ -63,8 +64,8 @@ pub struct Layer<T = u8> {
     pub photo: usize,
     /// Its part of the panorama: the bounding box of its mask with the margin of blending.
     pub bounds: Bounds,
-    /// Red, green, blue, and the mask: white on the side of the seams where this photograph is taken. Outside the mask are the colors of the photograph, beyond
-    /// its border those of the nearest pixel.
+    /// Red, green, blue, and the mask: white on the side of the seams where this photograph is taken. Outside the mask are the colors of the photograph as far
+    /// as blending needs them, beyond its border and that margin those of the nearest pixel.
     pub pixels: Image<T, 4>,
 }
 
@@ -241,10 +242,10 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     let coarse =
         seams::on_preview(&preview, &photo_of, options.seams, options.radiance, options.removes_transients, progress)?;
     let step = preview.step;
+    let regions = regions(&coarse, &preview, &layout, levels);
     drop(preview);
     clock.lap("seams");
 
-    let regions = regions(&coarse, step, &layout, levels);
     let drawing = Drawing { layout: &layout, regions: &regions, fields: &fields, options };
     let warped = warped(photos, &drawing, &gains, &scratch, progress)?;
     clock.lap("warp");
@@ -438,7 +439,7 @@ fn warped<'s, T: PhotoSample>(
     let mut current = load(0)?;
     for k in 0..placements.len() {
         let draw = || -> Result<Option<WarpedPhoto<T>>, RenderError> {
-            let (Some(photo), Some(region)) = (&current, drawing.regions[k]) else { return Ok(None) };
+            let (Some(photo), Some(region)) = (&current, &drawing.regions[k]) else { return Ok(None) };
             Ok(Some(drawing.warped_one(photo.view(), k, region, gains, &tone, &stage)?))
         };
         let (piece, next) = rayon::join(draw, || load(k + 1));

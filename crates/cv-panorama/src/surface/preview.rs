@@ -124,8 +124,12 @@ impl Preview {
             let field = fields.get(k).and_then(Option::as_ref).map(|f| f.scaled(s, 1.0 / shrink as f64));
             let view = downsampled_view(p, shrink, photo.size());
             let small = Placement { view, bounds, origin, ..*p };
-            let settings =
-                WarpSettings { displacement: field.as_ref(), interpolation: Interpolation::Bilinear, correction: None };
+            let settings = WarpSettings {
+                displacement: field.as_ref(),
+                interpolation: Interpolation::Bilinear,
+                correction: None,
+                region: None,
+            };
             let warped = warp(photo.view(), &small, &surface, bounds, settings, stage)?;
             let (eccentricity, radius) = distances(&small, &surface);
             stage.add(1)?;
@@ -208,7 +212,7 @@ fn distances(p: &Placement, surface: &Surface) -> (Vec<f32>, Vec<f32>) {
     let (mut eccentricity, mut radius) = (Vec::with_capacity(w * h), Vec::with_capacity(w * h));
     let (mut us, mut vs) = (vec![0.0; w], vec![0.0; w]);
     for y in 0..h {
-        map.row(y, &mut us, &mut vs);
+        map.row(y, 0, &mut us, &mut vs);
         for (u, v) in us.iter().zip(&vs) {
             let (x, y) = (u - cx, v - cy);
             eccentricity.push((x.abs() / (cx + 0.5)).max(y.abs() / (cy + 0.5)).powi(2).min(4.0));

@@ -6,6 +6,7 @@
 use crate::align::View;
 use crate::bit_depth::Channel;
 use crate::photometric::ExposureCorrection;
+use crate::regions::Region;
 use crate::rows::for_each_row_with;
 use crate::surface::{Bounds, DisplacementField, Placement, Surface};
 use cv_core::{Cancelled, DistortionModel, Image, ImageView, Matrix3, Point2, Sample, Stage};
@@ -51,6 +52,8 @@ pub(crate) struct WarpSettings<'a> {
     pub(crate) interpolation: Interpolation,
     /// Exposure correction; `None` for none.
     pub(crate) correction: Option<ExposureCorrection<'a>>,
+    /// The pixels that are sampled, where not all are; the others of a row repeat the nearest of them, with opacity 0.
+    pub(crate) region: Option<&'a Region>,
 }
 
 /// Warps a photograph to the canvas pixels `bounds`.
@@ -77,11 +80,16 @@ pub(crate) fn warp<T: Channel>(
         stage,
         || Row::new(width),
         |buffer, y, row| {
-            let (us, vs) = (&mut buffer.us[..], &mut buffer.vs[..]);
-            dispatch!(level, _simd => map.row(y, us, vs));
+            let whole = bounds.left..bounds.right;
+            let span = settings.region.map_or(whole, |region| region.span(bounds.top + y));
+            let (first, end) = (span.start - bounds.left, span.end - bounds.left);
+            let (us, vs) = (&mut buffer.us[..end - first], &mut buffer.vs[..end - first]);
+            dispatch!(level, _simd => map.row(y, first, us, vs));
             if let Some(field) = settings.displacement {
-                field.add_row((bounds.top + y) as f64, bounds.left as f64, us, vs);
+                dispatch!(level, _simd => field.add_row((bounds.top + y) as f64, span.start as f64, us, vs));
             }
+            let (before, rest) = row.split_at_mut(4 * first);
+            let (row, after) = rest.split_at_mut(4 * (end - first));
             match settings.interpolation {
                 Interpolation::Nearest => {
                     dispatch!(level, simd => sample_row::<_, _, Nearest>(simd, photo, buffer, row, correction))
@@ -91,6 +99,12 @@ pub(crate) fn warp<T: Channel>(
                 }
                 Interpolation::Bicubic => {
                     dispatch!(level, simd => sample_row::<_, _, Bicubic>(simd, photo, buffer, row, correction))
+                }
+            }
+            let sampled = row.as_chunks::<4>().0;
+            for (part, nearest) in [(before, sampled.first()), (after, sampled.last())] {
+                if let Some(&[r, g, b, _]) = nearest {
+                    part.as_chunks_mut::<4>().0.fill([r, g, b, T::default()]);
                 }
             }
         },
@@ -158,13 +172,13 @@ impl Map {
         Self { columns, middle, last, surface: *surface, top: bounds.top as f64 + placement.origin.y, lens }
     }
 
-    /// Computes the photograph coordinates of row `y` of the bounds. Rays behind the camera map far outside the photograph.
+    /// Computes the photograph coordinates of row `y` of the bounds, from column `left` of them. Rays behind the camera map far outside the photograph.
     #[inline(always)]
-    pub(crate) fn row(&self, y: usize, us: &mut [f32], vs: &mut [f32]) {
+    pub(crate) fn row(&self, y: usize, left: usize, us: &mut [f32], vs: &mut [f32]) {
         let (g, b, c) = self.surface.row(self.top + y as f64);
         let g = g as f32;
         let b: [f32; 3] = std::array::from_fn(|r| (self.middle[r] * b + self.last[r] * c) as f32);
-        for ((c, u), v) in self.columns.iter().zip(us.iter_mut()).zip(vs.iter_mut()) {
+        for ((c, u), v) in self.columns[left..].iter().zip(us.iter_mut()).zip(vs.iter_mut()) {
             // Rays at and behind the principal plane map far outside.
             let z = (g * c[2] + b[2]).max(1e-9);
             let inverse = 1.0 / z;
@@ -228,7 +242,10 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
     row: &mut [T],
     correction: Option<ExposureCorrection<'_>>,
 ) {
-    let Row { us, vs, colors: [reds, greens, blues], lifts, clipped } = buffer;
+    let n = row.len() / 4;
+    let [us, vs, lifts, clipped] =
+        [&mut buffer.us, &mut buffer.vs, &mut buffer.lifts, &mut buffer.clipped].map(|line| &mut line[..n]);
+    let [reds, greens, blues] = buffer.colors.each_mut().map(|line| &mut line[..n]);
     let (right, bottom) = ((photo.width() - 1) as f32, (photo.height() - 1) as f32);
     let corner = 4.0 / ((right + 1.0).powi(2) + (bottom + 1.0).powi(2));
     let (pixels, _) = row.as_chunks_mut::<4>();
@@ -250,7 +267,7 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
             let (x, y) = (u - 0.5 * right, v - 0.5 * bottom);
             *lift = correction.vignetting_stops(corner * (x * x + y * y));
         }
-        scale([reds, greens, blues], 1.0 / T::PER_LEVEL);
+        scale([&mut *reds, &mut *greens, &mut *blues], 1.0 / T::PER_LEVEL);
         if T::LINEAR {
             let factors = correction.gain.map(f32::exp2);
             for ((((pixel, r), g), b), lift) in
@@ -269,7 +286,7 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
         } else {
             correction.row_of_levels::<true>([&mut reds[..], &mut greens[..], &mut blues[..]], lifts, clipped);
         }
-        scale([reds, greens, blues], T::PER_LEVEL);
+        scale([&mut *reds, &mut *greens, &mut *blues], T::PER_LEVEL);
     }
     for (((pixel, &r), &g), &b) in pixels.iter_mut().zip(reds.iter()).zip(greens.iter()).zip(blues.iter()) {
         [pixel[0], pixel[1], pixel[2]] = [T::from_f32(r), T::from_f32(g), T::from_f32(b)];
@@ -278,7 +295,7 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
 
 /// Scales rows between sample units and gray levels.
 #[inline(always)]
-fn scale(rows: [&mut Vec<f32>; 3], factor: f32) {
+fn scale(rows: [&mut [f32]; 3], factor: f32) {
     if factor != 1.0 {
         rows.into_iter().flatten().for_each(|v| *v *= factor);
     }
@@ -335,7 +352,7 @@ mod tests {
     use nalgebra::Rotation3;
 
     const PLAIN: WarpSettings<'_> =
-        WarpSettings { displacement: None, interpolation: Interpolation::Bicubic, correction: None };
+        WarpSettings { displacement: None, interpolation: Interpolation::Bicubic, correction: None, region: None };
 
     fn placement(camera: Camera, r: Rotation3<f64>, bounds: Bounds) -> Placement {
         Placement {
