@@ -126,8 +126,11 @@ fn names(folder: &Path) -> Vec<String> {
 fn an_output_in_progress_is_removed() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    write_inputs(folder, (2400, 1800), 30);
-    fs::write(folder.join("rig.yaml"), RIG).unwrap();
+    // Large enough that writing takes longer than the program waits for a job to stop by itself.
+    write_inputs(folder, (4800, 3600), 30);
+    let sizes = [("2400", "4800"), ("1800", "3600"), ("1199.5", "2399.5"), ("899.5", "1799.5")];
+    let rig = sizes.iter().fold(RIG.to_owned(), |rig, (from, to)| rig.replace(from, to));
+    fs::write(folder.join("rig.yaml"), rig).unwrap();
     let out = folder.join("rectified");
     let args = ["rectify", "left.ppm", "right.ppm", "--rig", "rig.yaml", "--out", "rectified"];
     for twice in [false, true] {
@@ -137,7 +140,7 @@ fn an_output_in_progress_is_removed() {
             fs::create_dir(&out).unwrap();
             fs::write(out.join("left.png"), "old").unwrap();
             let mut child = start(folder, &args);
-            // While images of four megapixels are encoded, no callback runs.
+            // While images of 17 megapixels are encoded, no callback runs.
             while names(&out).len() < 2 && child.try_wait().unwrap().is_none() {
                 sleep(Duration::from_millis(1));
             }
