@@ -47,11 +47,11 @@ pub(crate) fn to_big_tiff(head: &[u8]) -> Option<BigTiffHead> {
     Some(BigTiffHead { bytes, offsets: offsets?, byte_counts: byte_counts? })
 }
 
-fn u16_at(bytes: &[u8], at: usize) -> Option<usize> {
+pub(crate) fn u16_at(bytes: &[u8], at: usize) -> Option<usize> {
     Some(u16::from_le_bytes(*bytes.get(at..at + 2)?.first_chunk()?).into())
 }
 
-fn u32_at(bytes: &[u8], at: usize) -> Option<usize> {
+pub(crate) fn u32_at(bytes: &[u8], at: usize) -> Option<usize> {
     Some(u32::from_le_bytes(*bytes.get(at..at + 4)?.first_chunk()?) as usize)
 }
 

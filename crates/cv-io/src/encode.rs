@@ -56,7 +56,7 @@ pub fn encode_png(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
 }
 
 /// Not generic, so that the encoder is compiled once and not for each pixel type.
-fn encode_png_parts(
+pub(crate) fn encode_png_parts(
     (width, height, color, depth, pixels): Parts,
     metadata: &Metadata,
     dpi: Option<f64>,
@@ -137,7 +137,7 @@ pub fn encode_jpeg(view: impl JpegPixels, quality: u8) -> Result<Vec<u8>, Format
     encode_jpeg_parts(view.parts(), quality, &Metadata::default())
 }
 
-fn encode_jpeg_parts(
+pub(crate) fn encode_jpeg_parts(
     (width, height, color, _, pixels): Parts,
     quality: u8,
     metadata: &Metadata,
@@ -156,25 +156,6 @@ fn encode_jpeg_parts(
         metadata,
     )?;
     Ok(bytes)
-}
-
-/// Encodes 8-bit samples without padding as JPEG.
-pub(crate) fn encode_jpeg_samples(
-    (width, height): (usize, usize),
-    color: ColorType,
-    samples: &[u8],
-    quality: u8,
-) -> Result<Vec<u8>, FormatError> {
-    encode_jpeg_parts((width, height, color, BitDepth::Eight, samples.to_vec()), quality, &Metadata::default())
-}
-
-/// Encodes 8-bit samples without padding as PNG.
-pub(crate) fn encode_png_samples(
-    (width, height): (usize, usize),
-    color: ColorType,
-    samples: &[u8],
-) -> Result<Vec<u8>, FormatError> {
-    encode_png_parts((width, height, color, BitDepth::Eight, samples.to_vec()), &Metadata::default(), None)
 }
 
 /// Encodes a JPEG whose rows are requested from `image`, from the top.

@@ -1,9 +1,9 @@
 //! Writing Deep Zoom images: an XML file and a folder of tiles, from the whole image down to one pixel by factors of 2, of which viewers such as
 //! OpenSeadragon load what is visible. (Microsoft, "Deep Zoom File Format Overview".)
 
-use crate::encode::{encode_jpeg_samples, encode_png_samples};
+use crate::encode::{encode_jpeg_parts, encode_png_parts};
 use crate::pending_writes::{PREFIX, PendingWrite, SUFFIX};
-use crate::{FormatError, IoError};
+use crate::{FormatError, IoError, Metadata};
 use png::{BitDepth, ColorType};
 use std::fs;
 use std::io;
@@ -48,8 +48,6 @@ pub(crate) struct DziWriter {
     color: ColorType,
     /// From the whole image to one pixel.
     levels: Vec<Level>,
-    /// Tile being encoded.
-    tile: Vec<u8>,
 }
 
 impl DziWriter {
@@ -70,8 +68,7 @@ impl DziWriter {
         if depth != BitDepth::Eight {
             return Err(refused("samples of 16 bits".to_owned()));
         }
-        let path = if path.is_symlink() { fs::canonicalize(path)? } else { path.to_owned() };
-        let folder = tile_folder(&path);
+        let (path, folder) = resolve(path)?;
         check_replaceable(&folder, &path)?;
         let parent = folder.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
         let make = || tempfile::Builder::new().prefix(PREFIX).suffix(SUFFIX).tempdir_in(parent);
@@ -93,7 +90,7 @@ impl DziWriter {
             // By the umask, unlike the temporary folder itself.
             fs::create_dir_all(temporary.path().join("files").join(i.to_string()))?;
         }
-        Ok(Self { folder, path, pending, temporary, color, levels, tile: Vec::new() })
+        Ok(Self { folder, path, pending, temporary, color, levels })
     }
 
     /// Writes the next rows: samples without padding.
@@ -138,22 +135,22 @@ impl DziWriter {
     }
 
     /// Writes the tiles of a tile row, which has the pixel rows `ys`.
-    fn write_tiles(&mut self, i: usize, tile_row: usize, ys: std::ops::Range<usize>) -> Result<(), FormatError> {
+    fn write_tiles(&self, i: usize, tile_row: usize, ys: std::ops::Range<usize>) -> Result<(), FormatError> {
         let channels = self.color.samples();
         let Level { width, top, ref rows, .. } = self.levels[i];
         let folder = self.temporary.path().join("files").join((self.levels.len() - 1 - i).to_string());
         for column in 0..width.div_ceil(TILE_SIZE) {
             let xs = Level::extent(column, width);
-            self.tile.clear();
+            let mut tile = Vec::with_capacity(xs.len() * ys.len() * channels);
             for y in ys.clone() {
                 let row = &rows[(y - top) * width * channels..][..width * channels];
-                self.tile.extend_from_slice(&row[xs.start * channels..xs.end * channels]);
+                tile.extend_from_slice(&row[xs.start * channels..xs.end * channels]);
             }
-            let size = (xs.len(), ys.len());
+            let parts = (xs.len(), ys.len(), self.color, BitDepth::Eight, tile);
             let bytes = if self.color == ColorType::Rgba {
-                encode_png_samples(size, self.color, &self.tile)?
+                encode_png_parts(parts, &Metadata::default(), None)?
             } else {
-                encode_jpeg_samples(size, self.color, &self.tile, TILE_QUALITY)?
+                encode_jpeg_parts(parts, TILE_QUALITY, &Metadata::default())?
             };
             fs::write(folder.join(format!("{column}_{tile_row}.{}", self.format())), bytes)?;
         }
@@ -190,8 +187,11 @@ impl DziWriter {
     }
 }
 
-fn tile_folder(path: &Path) -> PathBuf {
-    path.with_file_name(format!("{}_files", path.file_stem().unwrap_or_default().to_string_lossy()))
+/// Returns the path of the XML file, by following a symbolic link, and that of the folder of tiles.
+fn resolve(path: &Path) -> io::Result<(PathBuf, PathBuf)> {
+    let path = if path.is_symlink() { fs::canonicalize(path)? } else { path.to_owned() };
+    let folder = path.with_file_name(format!("{}_files", path.file_stem().unwrap_or_default().to_string_lossy()));
+    Ok((path, folder))
 }
 
 /// Checks that a Deep Zoom image can be written to `path`, before the work: a folder with the name of its tiles must belong to an image there.
@@ -200,7 +200,8 @@ fn tile_folder(path: &Path) -> PathBuf {
 /// [`IoError`] with [`FormatError::Os`].
 pub fn check_deep_zoom(path: impl AsRef<Path>) -> Result<(), IoError> {
     let path = path.as_ref();
-    check_replaceable(&tile_folder(path), path).map_err(|error| IoError::writing(path, FormatError::Os(error)))
+    let check = resolve(path).and_then(|(path, folder)| check_replaceable(&folder, &path));
+    check.map_err(|error| IoError::writing(path, FormatError::Os(error)))
 }
 
 /// Only a folder of tiles of the Deep Zoom image of the same name is replaced: web browsers save pages to folders named alike.
@@ -231,7 +232,7 @@ fn half_resolution(above: &[u8], below: &[u8], channels: usize) -> Vec<u8> {
 mod tests {
     use super::*;
     use crate::IoError;
-    use crate::{Metadata, read_image, write_image, write_image_rows};
+    use crate::{read_image, write_image, write_image_rows};
     use cv_core::Image;
 
     fn decode_png(path: &Path) -> Image<u8, 4> {

@@ -1,7 +1,7 @@
 //! Writing TIFF: strips with Deflate compression after horizontal differencing (TIFF 6.0, section 14, and Adobe's technical note on Deflate),
 //! little-endian. BigTIFF where 32-bit positions may not suffice.
 
-use crate::big_tiff::to_big_tiff;
+use crate::big_tiff::{to_big_tiff, u16_at, u32_at};
 use crate::{FormatError, Metadata};
 use exif::experimental::Writer;
 use exif::{Context, Field, In, Tag, Value};
@@ -266,13 +266,12 @@ impl<W: Write + Seek> TiffWriter<W> {
 
 /// Returns the position of the values of a field of 32-bit numbers in the first directory of a little-endian TIFF.
 fn value_position(head: &[u8], tag: u16) -> Option<u64> {
-    let u16_at = |i: usize| Some(u16::from_le_bytes(*head.get(i..i + 2)?.first_chunk()?));
-    let u32_at = |i: usize| Some(u32::from_le_bytes(*head.get(i..i + 4)?.first_chunk()?));
-    let directory = u32_at(4)? as usize;
-    let entries = (0..usize::from(u16_at(directory)?)).map(|i| directory + 2 + 12 * i);
-    let entry = entries.into_iter().find(|&at| u16_at(at) == Some(tag))?;
+    let directory = u32_at(head, 4)?;
+    let mut entries = (0..u16_at(head, directory)?).map(|i| directory + 2 + 12 * i);
+    let entry = entries.find(|&at| u16_at(head, at) == Some(tag.into()))?;
     // One value of four bytes is in the entry itself.
-    if u32_at(entry + 4)? == 1 { Some(entry as u64 + 8) } else { u32_at(entry + 8).map(u64::from) }
+    let position = if u32_at(head, entry + 4)? == 1 { entry + 8 } else { u32_at(head, entry + 8)? };
+    Some(position as u64)
 }
 
 /// Applies horizontal differencing to 8-bit samples.

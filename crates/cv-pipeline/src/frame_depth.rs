@@ -3,7 +3,7 @@
 use crate::depth::{check_matched_fraction, check_range, compute_depth, initial_alignment, matcher_options, to_rgb8};
 use crate::vertical_offset::{Alignment, VerticalOffset};
 use crate::{DepthError, DepthOptions, DisparityRange, Progress, RigDepthResult};
-use cv_core::{Image, ImageView, Mask, PointCloud, Pose, StageClock, Vector3};
+use cv_core::{Image, ImageView, PointCloud, Pose, StageClock, Vector3};
 use cv_imgproc::{Pixel, WarpMap};
 use cv_stereo::{DisparityMap, Intensity, Rectification, RectifyError, StereoGeometry, StereoMatcher, StereoOptions};
 use std::any::Any;
@@ -16,8 +16,6 @@ pub struct FrameDepth {
     rectification: Option<Rectification>,
     /// Warp maps of both rectified views, computed at the first frame.
     maps: Option<[WarpMap; 2]>,
-    /// Pixels of the rectified images that have data.
-    masks: Option<[Mask; 2]>,
     /// The rectified images of the last frame, whose memory is used again: two images of the frames' type.
     rectified: Option<Box<dyn Any + Send + Sync>>,
     geometry: Option<StereoGeometry>,
@@ -42,7 +40,6 @@ impl FrameDepth {
             options,
             rectification: None,
             maps: None,
-            masks: None,
             rectified: None,
             geometry,
             matcher,
@@ -85,7 +82,7 @@ impl FrameDepth {
         let matcher = get_or_create_matcher(
             &mut self.matcher,
             &self.options,
-            &self.masks,
+            &self.maps,
             &mut self.alignment,
             [left, right],
             progress,
@@ -127,7 +124,7 @@ impl FrameDepth {
         let matcher = get_or_create_matcher(
             &mut self.matcher,
             &self.options,
-            &self.masks,
+            &self.maps,
             &mut self.alignment,
             [left, right],
             progress,
@@ -176,9 +173,8 @@ impl FrameDepth {
             Some(maps) => maps,
             None => {
                 let maps = [views[0].map(progress)?, views[1].map(progress)?];
-                self.masks = Some(maps.each_ref().map(WarpMap::inside));
-                if let (Some(matcher), Some([left, right])) = (&mut self.matcher, &self.masks) {
-                    matcher.set_masks(Some([left, right]));
+                if let Some(matcher) = &mut self.matcher {
+                    set_masks(matcher, &maps);
                 }
                 maps
             }
@@ -196,11 +192,17 @@ impl FrameDepth {
     }
 }
 
+/// Tells a matcher which pixels of the rectified images have data.
+fn set_masks(matcher: &mut StereoMatcher, maps: &[WarpMap; 2]) {
+    let [left, right] = maps.each_ref().map(WarpMap::inside);
+    matcher.set_masks(Some([&left, &right]));
+}
+
 /// Returns the matcher. It is created for the range of disparities of this pair if there is none.
 fn get_or_create_matcher<'m, T: Intensity + Pixel, const C: usize>(
     matcher: &'m mut Option<StereoMatcher>,
     options: &DepthOptions,
-    masks: &Option<[Mask; 2]>,
+    maps: &Option<[WarpMap; 2]>,
     alignment: &mut Alignment,
     [left, right]: [ImageView<'_, T, C>; 2],
     progress: &dyn Progress,
@@ -209,7 +211,9 @@ fn get_or_create_matcher<'m, T: Intensity + Pixel, const C: usize>(
         Some(created) => created,
         None => {
             let mut created = StereoMatcher::new(matcher_options(left, right, options, alignment, progress)?)?;
-            created.set_masks(masks.as_ref().map(|[left, right]| [left, right]));
+            if let Some(maps) = maps {
+                set_masks(&mut created, maps);
+            }
             created
         }
     };

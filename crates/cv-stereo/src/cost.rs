@@ -59,6 +59,12 @@ impl Frame<'_> {
         start..((column + 1 - columns.start as i64).clamp(0, n) as usize).max(start)
     }
 
+    /// Returns whether the correspondence at index `k` is inside the right image and has data.
+    pub(crate) fn has_match(&self, masks: &RowMasks<'_>, x: usize, k: usize) -> bool {
+        let column = x as i64 - self.min_disparity - k as i64;
+        self.inside(x).contains(&k) && !masks.hides_right(column as usize)
+    }
+
     /// Returns the cost, at every disparity, of a pixel of the left image without data. The largest that does not overflow path costs, so
     /// that the pixel is the match of no pixel of the right image.
     pub(crate) fn masked_cost(&self) -> u8 {
@@ -214,12 +220,8 @@ fn set_masked_costs(frame: &Frame<'_>, masks: &RowMasks<'_>, x: usize, out: &mut
     if masks.hides_left(x) {
         return;
     }
-    let inside = frame.inside(x);
     let Layout { group, lanes, .. } = frame.layout;
-    let has_data = |k: &usize| {
-        let column = x as i64 - frame.min_disparity - *k as i64;
-        inside.contains(k) && !masks.hides_right(column as usize)
-    };
+    let has_data = |k: &usize| frame.has_match(masks, x, *k);
     let (mut sum, mut count) = (0, 0);
     for k in (0..frame.disparities).filter(has_data) {
         sum += u32::from(out[place(k, group, lanes)]);

@@ -333,11 +333,7 @@ fn set_masked_costs(frame: &Frame<'_>, masks: &RowMasks<'_>, x: usize, first: us
         out.fill(frame.masked_cost());
         return;
     }
-    let inside = frame.inside(x);
-    let has_data = |k: usize| {
-        let column = x as i64 - frame.min_disparity - k as i64;
-        inside.contains(&k) && !masks.hides_right(column as usize)
-    };
+    let has_data = |k: usize| frame.has_match(masks, x, k);
     let indices = || (first..first + WINDOW).zip(0..).filter(|(k, _)| has_data(*k));
     let (sum, count) =
         indices().fold((0, 0), |(sum, count), (_, at): (_, usize)| (sum + u32::from(out[at]), count + 1));

@@ -5,6 +5,7 @@ use super::{Args, Sequence, report};
 use crate::frame::{Context, Explain, Failure, Outcome, expand_images, stands_for_many};
 use crate::photos::{Photos, at_own_depth};
 use cv_core::Stage;
+use cv_pipeline::stereo::DisparityMap;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -44,16 +45,14 @@ impl Args {
             let one = self.of_frame(left);
             let start = Instant::now();
             let failure = |error| self.failure(error);
-            let fractions = if needs_depth {
+            let fractions = |map: &DisparityMap| (map.matched_fraction(), map.valid_fraction(), map.no_data_fraction());
+            let (matched, valid, no_data) = if needs_depth {
                 let job =
                     at_own_depth!(photos, |a, b| sequence.frames.next_depth(a, b, self.wants_points(context), &stage));
                 let job = job.map_err(failure).during(left.display())?;
                 seconds += start.elapsed().as_secs_f64();
                 one.write(&job, sequence.meters_per_unit, context)?;
-                let fractions = (job.maps.map.matched_fraction(), job.maps.map.valid_fraction());
-                if frames.is_empty() {
-                    super::report_border(&job.maps.map, context);
-                }
+                let fractions = fractions(&job.maps.map);
                 if context.wants_report() && first.is_none() {
                     first = Some(job);
                 }
@@ -63,19 +62,17 @@ impl Args {
                 let map = map.map_err(failure).during(left.display())?;
                 seconds += start.elapsed().as_secs_f64();
                 one.write_disparity(map, context)?;
-                if frames.is_empty() {
-                    super::report_border(map, context);
-                }
-                (map.matched_fraction(), map.valid_fraction())
+                fractions(map)
             };
             if frames.is_empty() {
+                super::report_border(no_data, context);
                 self.report_range(sequence, context);
             }
             if !aligned && let Some(offset) = sequence.frames.vertical_offset() {
                 super::warn_of_alignment(&offset, context);
                 aligned = true;
             }
-            frames.push((left.clone(), fractions.0, fractions.1));
+            frames.push((left.clone(), matched, valid));
             stage.add(1)?;
         }
         let count = frames.len() as f64;

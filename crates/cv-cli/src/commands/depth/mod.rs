@@ -223,7 +223,7 @@ impl Run for Args {
             warn_of_alignment(offset, context);
         }
         warn_of_filling(&job.maps, context);
-        report_border(map, context);
+        report_border(map.no_data_fraction(), context);
         context.report(|| report::report(&job, &[]))?;
         let (width, height) = map.disparity.size();
         Ok(Outcome::new(job.maps.stages.clone())
@@ -257,9 +257,8 @@ fn warn_of_alignment(offset: &VerticalOffset, context: &Context) {
     ));
 }
 
-/// Reports the black border of the left image.
-fn report_border(map: &DisparityMap, context: &Context) {
-    let fraction = map.no_data_fraction();
+/// Reports the fraction of the left image that is a black border.
+fn report_border(fraction: f64, context: &Context) {
     if fraction > 0.0 {
         context.note(format!(
             "{:.1} % of the left image is a black border of rectification: it has no disparity, and the other fractions are of the rest",
