@@ -64,7 +64,7 @@ def run(job, moment=None):
             if timer is not None:
                 timer.start()
             job()
-        except (ValueError, RuntimeError):
+        except (epipole.errors.EpipoleError, ValueError, RuntimeError):
             # Some jobs refuse these images: their time until then is measured all the same.
             pass
         finally:
