@@ -214,11 +214,11 @@ class _Depth(_Worker):
     columns, figures = ("left", "right"), ("matched_fraction",)
 
     def prepare(self, **options):
-        self.options = _checked("depth", options)
+        self.matcher = epipole._native.PairDepth(**_checked("depth", options))
 
     def do(self, row, path):
         left, right = (epipole.read_image(row[column]) for column in self.columns)
-        found = epipole.depth(left, right, **self.options)
+        found = self.matcher.compute(left, right)
         _arrays(path, {"disparity": found.disparity, "state": found.state, "depth": found.depth})
         return {"matched_fraction": found.matched_fraction}
 

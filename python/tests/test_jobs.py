@@ -5,6 +5,7 @@ import pickle
 import epipole
 import numpy as np
 import pytest
+import scenes
 from epipole import errors
 
 
@@ -38,6 +39,31 @@ def test_a_matcher_equals_depth_and_writes_to_the_given_array(pair):
     locked.flags.writeable = False
     with pytest.raises(ValueError, match="read-only"):
         matcher.compute(*pair, out=locked)
+
+
+@pytest.mark.parametrize("options", [{}, {"disparities": "auto"}, {"rig": True, "cloud": True}, {"focal": 300.0, "baseline": 0.2}])
+def test_pairs_after_other_pairs_give_the_maps_of_depth(pair, options):
+    height, width = pair[0].shape[:2]
+    if "rig" in options:
+        camera = epipole.Camera(width, height, [[300.0, 0, (width - 1) / 2], [0, 300.0, (height - 1) / 2], [0, 0, 1]])
+        # The cameras are turned a little, so that the rectified images differ from the photographs.
+        options = {**options, "rig": epipole.Rig(camera, camera, scenes.rotation(0, 0.01, 0), [-0.25, 0, 0])}
+    options = {"disparities": 64, "threads": 1, **options}
+    # Shifted down by 3 px, the second pair needs a correction that the others must not inherit; the third has another size if there is no rig.
+    shifted = (pair[0], np.roll(pair[1], 3, axis=0))
+    other = tuple(image[::-1].copy() for image in pair) if "rig" in options else tuple(image[20:].copy() for image in pair)
+    matcher = epipole._native.PairDepth(**options)
+    for left, right in (pair, shifted, other, pair):
+        expected, found = epipole.depth(left, right, **options), matcher.compute(left, right)
+        assert np.array_equal(found.disparity, expected.disparity, equal_nan=True)
+        assert np.array_equal(found.state, expected.state)
+        assert found.vertical_offset == expected.vertical_offset
+        assert (found.depth is None) == (expected.depth is None)
+        if found.depth is not None:
+            assert np.array_equal(found.depth, expected.depth, equal_nan=True)
+    with pytest.raises(errors.EpipoleError):
+        matcher.compute(pair[0], np.random.default_rng(0).integers(0, 256, pair[0].shape, np.uint8))
+    assert np.array_equal(matcher.compute(*pair).disparity, epipole.depth(*pair, **options).disparity, equal_nan=True)
 
 
 def test_the_homography_of_a_plane(plane):

@@ -54,7 +54,7 @@ def test_the_stub_has_all_public_names():
     own = {"AprilGrid", "ArucoGrid", "CharucoBoard", "Chessboard", "ColorModel", "Features", "PointCloud", "Reconstruction"}
     public = {name for name in epipole.__all__ if name not in ("errors", "boards", "__version__")}
     # Internal classes and functions of the Python wrappers.
-    assert there - {"FittedColorModel", "read_model", "write_model"} == public - own
+    assert there - {"FittedColorModel", "PairDepth", "read_model", "write_model"} == public - own
     for name in epipole.__all__:
         assert hasattr(epipole, name)
     assert epipole.Depth.__name__ == "Depth" and epipole.errors.EpipoleError

@@ -9,7 +9,7 @@ use cv_stereo::{DisparityMap, Intensity, Rectification, RectifyError, StereoGeom
 use std::any::Any;
 
 /// Matches the frames of a film with one allocation and one range of disparities. With [`DisparityRange::FromMatches`],
-/// the first frame determines the range.
+/// the first frame determines the range. With [`FrameDepth::forget`] also pairs that are not of one film.
 #[derive(Debug)]
 pub struct FrameDepth {
     options: DepthOptions,
@@ -34,7 +34,7 @@ impl FrameDepth {
         check_range(options.range, geometry.as_ref())?;
         // Validates the options before the first frame.
         let matcher = Some(StereoMatcher::new(options.stereo.clone())?);
-        let matcher = matcher.filter(|_| options.disparities == DisparityRange::Given);
+        let matcher = matcher.filter(|_| fits_all_pairs(&options));
         Ok(Self {
             alignment: initial_alignment(&options),
             options,
@@ -54,6 +54,14 @@ impl FrameDepth {
     pub fn of_rig(options: DepthOptions, rectification: &Rectification) -> Result<Self, DepthError> {
         let frames = Self::new(options, Some(rectification.geometry))?;
         Ok(Self { rectification: Some(*rectification), ..frames })
+    }
+
+    /// Makes the next pair independent of the previous ones: its vertical disparity and, with
+    /// [`DisparityRange::FromMatches`], its range are determined anew. Memory and warp maps are kept.
+    pub fn forget(&mut self) {
+        self.alignment = initial_alignment(&self.options);
+        self.matcher = self.matcher.take().filter(|_| fits_all_pairs(&self.options));
+        self.matcher.iter_mut().for_each(StereoMatcher::forget_frame);
     }
 
     /// Returns the vertical disparity that is corrected, estimated on the first frame that determines it; `None` where
@@ -190,6 +198,11 @@ impl FrameDepth {
         }
         Ok(Some(pair))
     }
+}
+
+/// Whether one matcher serves any pair: its range is given, and it needs no plain matcher for the vertical disparity.
+fn fits_all_pairs(options: &DepthOptions) -> bool {
+    options.disparities == DisparityRange::Given && !options.stereo.quality
 }
 
 /// Tells a matcher which pixels of the rectified images have data.

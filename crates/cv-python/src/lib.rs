@@ -9,7 +9,7 @@
 //! | `camera.rs` | `Camera`, `Rig` |
 //! | `calibration.rs` | `find_board`, `calibrate` |
 //! | `rectify.rs` | `rectify`, `undistort`, `Undistorter` |
-//! | `stereo.rs` | `StereoMatcher`, `depth`, `evaluate_disparity` |
+//! | `stereo.rs` | `StereoMatcher`, `depth`, `PairDepth` (for `epipole.ray`), `evaluate_disparity` |
 //! | `matching.rs` | `extract_features`, `match`, `match_features` |
 //! | `estimate.rs` | `estimate_homography`, `estimate_fundamental`, `estimate_essential`, `estimate_pose` |
 //! | `reconstruct.rs`, `sfm_photograph.rs`, `sfm.rs` | `reconstruct`, `sfm_features`, `sfm` |
@@ -103,6 +103,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<camera::PyCamera>()?;
     module.add_class::<camera::PyRig>()?;
     module.add_class::<rectify::PyUndistorter>()?;
+    module.add_class::<stereo::PyPairDepth>()?;
     module.add_class::<stereo::PyStereoMatcher>()?;
     module.add_class::<segment::PyColorModel>()?;
     module.add_class::<sfm_photograph::PySfmPhotograph>()?;

@@ -8,10 +8,9 @@ use crate::options::Options;
 use crate::rectify::{self, view_options};
 use crate::results::{self, data, object};
 use crate::{cloud, with_views};
-use cv_core::{Cancelled, GrayF32, Progress, StageClock, StereoRig};
+use cv_core::{Cancelled, GrayF32, PointCloud, Progress, RgbU8, StageClock, StereoRig};
 use cv_pipeline::stereo::{
-    DisparityMap, GeometryError, PixelState, Rectification, RectifyOptions, StereoError, StereoGeometry, StereoMatcher,
-    StereoOptions,
+    DisparityMap, PixelState, Rectification, RectifyOptions, StereoError, StereoGeometry, StereoMatcher, StereoOptions,
 };
 use cv_pipeline::{DepthError, DepthOptions, DepthResult, DisparityRange, FrameDepth, RigDepthResult};
 use numpy::{PyArray2, PyArrayMethods, PyReadwriteArray2, PyUntypedArrayMethods};
@@ -102,15 +101,49 @@ impl DepthArguments {
         Ok(Self { options: o, focal, baseline, offset, rig, view, cloud, run: Run::read(options)? })
     }
 
-    /// Returns the geometry of a rectified pair, if known.
-    fn geometry(&self, (width, height): (usize, usize)) -> PyResult<Option<Result<StereoGeometry, GeometryError>>> {
-        match (self.focal, self.baseline) {
-            (None, None) => Ok(None),
-            (Some(focal), Some(baseline)) => {
+    /// Reads the options of a call; an option that does not exist is an error.
+    fn finish(options: Option<&Bound<'_, PyDict>>) -> PyResult<Self> {
+        let mut options = Options::new("depth", options);
+        let arguments = Self::read(&mut options)?;
+        options.finish()?;
+        Ok(arguments)
+    }
+
+    fn rectification(&self, py: Python<'_>) -> PyResult<Option<Rectification>> {
+        let rectification = self.rig.map(|rig| Rectification::new(&rig, &self.view)).transpose();
+        rectification.map_err(|error| refused(py, &error))
+    }
+
+    /// Returns the geometry of the rectified pair, if known.
+    fn geometry(
+        &self,
+        py: Python<'_>,
+        rectification: Option<&Rectification>,
+        left: &ImageArg<'_>,
+    ) -> PyResult<Option<StereoGeometry>> {
+        match (rectification, self.focal, self.baseline) {
+            (Some(rectification), ..) => Ok(Some(rectification.geometry)),
+            (None, None, None) => Ok(None),
+            (None, Some(focal), Some(baseline)) => {
+                let (width, height, _) = left.shape();
                 let geometry = StereoGeometry::from_focal(width, height, focal, baseline);
-                Ok(Some(geometry.map(|geometry| StereoGeometry { offset: self.offset, ..geometry })))
+                let geometry = geometry.map_err(|error| refused(py, &error))?;
+                Ok(Some(StereoGeometry { offset: self.offset, ..geometry }))
             }
             _ => Err(PyTypeError::new_err("depth() needs focal and baseline together")),
+        }
+    }
+
+    /// Creates a matcher of pairs.
+    fn frames(
+        &self,
+        rectification: Option<&Rectification>,
+        geometry: Option<StereoGeometry>,
+    ) -> Result<FrameDepth, DepthError> {
+        let options = self.options.clone();
+        match rectification {
+            Some(rectification) => FrameDepth::of_rig(options, rectification),
+            None => FrameDepth::new(options, geometry),
         }
     }
 }
@@ -134,29 +167,74 @@ pub(crate) fn depth<'py>(
     right: &Bound<'py, PyAny>,
     options: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let mut options = Options::new("depth", options);
-    let arguments = DepthArguments::read(&mut options)?;
-    options.finish()?;
+    let arguments = DepthArguments::finish(options)?;
     let (left, right) = (ImageArg::new(left, "left")?, ImageArg::new(right, "right")?);
-    let (width, height, _) = left.shape();
-    let geometry =
-        arguments.geometry((width, height))?.transpose().map_err(|error: GeometryError| refused(py, &error))?;
-    let rectification = arguments.rig.map(|rig| Rectification::new(&rig, &arguments.view)).transpose();
-    let rectification = rectification.map_err(|error| refused(py, &error))?;
-    let geometry = rectification.map(|r| r.geometry).or(geometry);
-    let (found, images, cloud) = with_views!(py, [left, right], |a, b| arguments.run.run(py, |progress| {
-        let options = &arguments.options;
+    let rectification = arguments.rectification(py)?;
+    let geometry = arguments.geometry(py, rectification.as_ref(), &left)?;
+    let result = with_views!(py, [left, right], |a, b| arguments.run.run(py, |progress| {
         if rectification.is_none() && !arguments.cloud {
-            let found = cv_pipeline::depth(a, b, geometry.as_ref(), options, progress)?;
+            let found = cv_pipeline::depth(a, b, geometry.as_ref(), &arguments.options, progress)?;
             return Ok::<_, DepthError>((Found::new(found), None, None));
         }
-        let mut frames = match &rectification {
-            Some(rectification) => FrameDepth::of_rig(options.clone(), rectification)?,
-            None => FrameDepth::new(options.clone(), geometry)?,
-        };
+        let mut frames = arguments.frames(rectification.as_ref(), geometry)?;
         let RigDepthResult { images, maps, cloud } = frames.next_depth(a, b, arguments.cloud, progress)?;
         Ok((Found::new(maps), rectification.map(|_| images), arguments.cloud.then_some(cloud)))
     }))?;
+    made(py, result, geometry)
+}
+
+/// [`depth()`] over many pairs, which need not be of one film: the memory is reused, and the warp maps of a rig are computed once. Used by the workers of `epipole.ray`.
+#[pyclass(frozen, module = "epipole._native", name = "PairDepth")]
+pub(crate) struct PyPairDepth {
+    arguments: DepthArguments,
+    rectification: Option<Rectification>,
+    /// The buffers, and the size of the images that they are for.
+    worker: Shared<Option<((usize, usize), FrameDepth)>>,
+}
+
+#[pymethods]
+impl PyPairDepth {
+    #[new]
+    #[pyo3(signature = (**options))]
+    fn new(py: Python<'_>, options: Option<&Bound<'_, PyDict>>) -> PyResult<Self> {
+        let arguments = DepthArguments::finish(options)?;
+        let rectification = arguments.rectification(py)?;
+        Ok(Self { arguments, rectification, worker: Shared::new(None) })
+    }
+
+    /// As `depth`.
+    fn compute<'py>(
+        &self,
+        py: Python<'py>,
+        left: &Bound<'py, PyAny>,
+        right: &Bound<'py, PyAny>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let Self { arguments, rectification, worker } = self;
+        let (left, right) = (ImageArg::new(left, "left")?, ImageArg::new(right, "right")?);
+        let geometry = arguments.geometry(py, rectification.as_ref(), &left)?;
+        let result = with_views!(py, [left, right], |a, b| arguments.run.run(py, |progress: &dyn Progress| {
+            let mut taken = worker.take(progress)?;
+            let Some(kept) = taken.get() else { return Err(Cancelled.into()) };
+            let mut frames = match kept.take() {
+                Some((size, frames)) if size == a.size() => frames,
+                _ => arguments.frames(rectification.as_ref(), geometry)?,
+            };
+            frames.forget();
+            let result = frames.next_depth(a, b, arguments.cloud, progress);
+            *kept = Some((a.size(), frames));
+            let RigDepthResult { images, maps, cloud } = result?;
+            Ok::<_, DepthError>((Found::new(maps), rectification.map(|_| images), arguments.cloud.then_some(cloud)))
+        }))?;
+        made(py, result, geometry)
+    }
+}
+
+/// Makes the Python result.
+fn made<'py>(
+    py: Python<'py>,
+    (found, images, cloud): (Found, Option<[RgbU8; 2]>, Option<PointCloud>),
+    geometry: Option<StereoGeometry>,
+) -> PyResult<Bound<'py, PyAny>> {
     let Found { depth: found, state, depth_deviation, valid, matched, stages } = found;
     let (width, height) = found.map.disparity.size();
     let none = || object(py, py.None());
