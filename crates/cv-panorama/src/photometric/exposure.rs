@@ -92,8 +92,14 @@ const CAUCHY_SCALE: f64 = 2.5;
 const VIGNETTING_SIGMA: f64 = 0.5;
 /// Prior standard deviation of the response coefficients.
 const RESPONSE_SIGMA: f64 = 1.0;
-/// Weight of these priors relative to the sum of the weights of all samples.
+/// Prior standard deviation of the exponent of the response relative to sRGB, which overlaps do not determine: a power of all radiances fits them equally (Grossberg & Nayar
+/// 2003, "Determining the camera response from images: what is knowable?").
+const EXPONENT_SIGMA: f64 = 0.1;
+/// Weight of the priors of vignetting and exponent relative to the sum of the weights of all samples.
 const PRIOR_WEIGHT: f64 = 2e-3;
+/// Weight of the prior of the response coefficients. Overlaps determine the shape of the response, but weakly: at ten times this weight the gains of the outer
+/// photographs of a chain of eight are off by 0.1 to 0.2 stops.
+const SHAPE_PRIOR_WEIGHT: f64 = 2e-4;
 
 /// Unknowns of an equation: two gains, vignetting, response.
 const TERMS: usize = 4 + COEFFICIENT_COUNT;
@@ -176,33 +182,34 @@ pub(crate) fn estimate_gains(
 /// Maximum number of preview pixels sampled for the mean level.
 const MAX_MEAN_SAMPLES: usize = 10_000;
 
+/// Margin in gray levels by which the mean level of the panorama stays inside the range of the photographs' means: blending and rounding change it by a tenth.
+const MEAN_MARGIN: f64 = 0.25;
+
 /// Chooses the common exposure, which the overlaps leave free: the mean level of the panorama is kept at that of the photographs, clamped to the range of their means. Each canvas
 /// position counts once, with the mean of the photographs that cover it. (Where several photographs cover the dark parts of a scene and one the bright parts, that exceeds the mean of every photograph.)
 fn anchor(gains: &mut Gains, preview: &Preview, photo_of: &[usize]) {
     let (width, height) = (preview.width, preview.height);
     let step = (width * height).div_ceil(MAX_MEAN_SAMPLES).max(1);
     let mut colors = Vec::new();
-    let (mut places, mut of_photo) = (0.0, vec![(0.0, 0.0); gains.gains.len()]);
+    let mut places = 0.0;
     for (x, y) in (0..width * height).step_by(step).map(|i| (i % width, i / width)) {
         let first = colors.len();
         for (piece, &photo) in preview.pieces.iter().zip(photo_of) {
             let b = piece.warped.bounds;
             if let Some(color) = piece.warped.color(x, y) {
-                let color = color.map(f32::from);
-                let (sum, count) = &mut of_photo[photo];
-                *sum += f64::from(color.iter().sum::<f32>());
-                *count += 1.0;
-                colors.push((color, piece.radius[(y - b.top) * b.width() + x - b.left], photo, 0.0));
+                colors.push((color.map(f32::from), piece.radius[(y - b.top) * b.width() + x - b.left], photo, 0.0));
             }
         }
         let share = 1.0 / (colors.len() - first).max(1) as f64;
         colors[first..].iter_mut().for_each(|c| c.3 = share);
         places += f64::from(u8::from(colors.len() > first));
     }
-    let means = || of_photo.iter().filter(|(_, count)| *count > 0.0).map(|(sum, count)| sum / count);
+    let means = || preview.pieces.iter().map(|piece| piece.mean_level);
     let (darkest, brightest) = (means().fold(f64::INFINITY, f64::min), means().fold(0.0, f64::max));
+    let middle = 0.5 * (darkest + brightest);
+    let (low, high) = ((darkest + MEAN_MARGIN).min(middle), (brightest - MEAN_MARGIN).max(middle));
     let before: f64 = colors.iter().map(|(color, _, _, share)| share * f64::from(color[0] + color[1] + color[2])).sum();
-    let before = before.min(brightest * places).max(darkest.min(brightest) * places);
+    let before = before.min(3.0 * high * places).max(3.0 * low * places);
     let shifted = |stops: f64| {
         let factor = stops.exp2() as f32;
         Gains { gains: gains.gains.iter().map(|g| g.map(|g| g * factor)).collect(), ..gains.clone() }
@@ -270,6 +277,7 @@ fn solve(samples: &[Sample], unknowns: Unknowns, stage: &Stage<'_>) -> Result<DV
     let gains = 3 * unknowns.photos;
     let basis: [[f64; COEFFICIENT_COUNT]; 256] = std::array::from_fn(|v| Response::basis(v as f64 / 255.0));
     let srgb: Vec<f64> = (0..=255).map(|v| Response::srgb(f64::from(v) / 255.0)).collect();
+    let exponent = Response::exponent();
     let mut solution = DVector::zeros(n);
     for round in 0..10 {
         let curve = Response { coefficients: std::array::from_fn(|k| solution[gains + 2 + k]) };
@@ -327,9 +335,15 @@ fn solve(samples: &[Sample], unknowns: Unknowns, stage: &Stage<'_>) -> Result<DV
         for k in 0..gains {
             normal[(k, k)] += 1e-6 * total.max(1.0);
         }
-        for k in gains..n {
-            let sigma = if k < gains + 2 { VIGNETTING_SIGMA } else { RESPONSE_SIGMA };
-            normal[(k, k)] += PRIOR_WEIGHT * total.max(1.0) / (sigma * sigma);
+        let weight = total.max(1.0);
+        for k in gains..gains + 2 {
+            normal[(k, k)] += PRIOR_WEIGHT * weight / VIGNETTING_SIGMA.powi(2);
+        }
+        for (k, a) in exponent.iter().enumerate() {
+            normal[(gains + 2 + k, gains + 2 + k)] += SHAPE_PRIOR_WEIGHT * weight / RESPONSE_SIGMA.powi(2);
+            for (l, b) in exponent.iter().enumerate() {
+                normal[(gains + 2 + k, gains + 2 + l)] += PRIOR_WEIGHT * weight * a * b / EXPONENT_SIGMA.powi(2);
+            }
         }
         let Some(factor) = normal.cholesky() else { break };
         solution = factor.solve(&right);
@@ -356,6 +370,14 @@ mod tests {
         (-3.0 + 2.2 * wave).exp2()
     }
 
+    /// A piece that shows its whole photograph.
+    fn piece(bounds: Bounds, pixels: Image<u8, 4>, radius: Vec<f32>) -> Piece {
+        let clipped = vec![false; radius.len()];
+        let colors = pixels.pixels().flat_map(|p| [p[0], p[1], p[2]]);
+        let mean_level = colors.map(f64::from).sum::<f64>() / (3 * radius.len()) as f64;
+        Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: radius.clone(), radius, clipped, mean_level }
+    }
+
     /// Three photographs of 60 x 40, 30 apart, of one scene, their light multiplied by known factors and less toward their corners.
     fn preview(factors: &[[f64; 3]; 3], fall_off: f64, contrast: f64, moved: bool) -> Preview {
         let pieces = (0..3)
@@ -374,8 +396,7 @@ mod tests {
                     let [r, g, b] = [0, 1, 2].map(|c| (255.0 * level(light(c), contrast)).round() as u8);
                     [r, g, b, 255]
                 });
-                let clipped = vec![false; radius.len()];
-                Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: radius.clone(), radius, clipped }
+                piece(bounds, pixels, radius)
             })
             .collect();
         Preview { step: 1, width: 120, height: 40, pieces }
@@ -466,14 +487,13 @@ mod tests {
     fn the_mean_level_is_one_that_a_photograph_could_have() {
         // Two photographs of 60 columns, 30 apart: what both show is dark, the rest bright. Each has a mean of 110; the panorama, place by place, one of 133.
         let bright = |x: usize| !(30..60).contains(&x);
-        let piece = |k: usize| {
+        let shifted = |k: usize| {
             let bounds = Bounds { left: 30 * k, top: 0, right: 30 * k + 60, bottom: 40 };
             let value = |x: usize| if bright(30 * k + x) { 180 } else { 40 };
             let pixels = Image::from_fn(60, 40, |x, _| [value(x), value(x), value(x), 255]);
-            let (radius, clipped) = (vec![0.0; 60 * 40], vec![false; 60 * 40]);
-            Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: radius.clone(), radius, clipped }
+            piece(bounds, pixels, vec![0.0; 60 * 40])
         };
-        let mut set = Preview { step: 1, width: 90, height: 40, pieces: vec![piece(0), piece(1)] };
+        let mut set = Preview { step: 1, width: 90, height: 40, pieces: vec![shifted(0), shifted(1)] };
         let gains = estimate_gains(&set, &[0, 1], 2, Exposure::Match, &Silent).unwrap();
         set.correct(&gains, &[0, 1]);
         let level = |x: usize| f64::from(set.pieces[usize::from(x >= 60)].warped.color(x, 7).unwrap()[0]);

@@ -22,6 +22,17 @@ impl Response {
         [rest, rest * v, rest * v * v]
     }
 
+    /// Returns the derivatives, by coefficient, of the exponent of the power of the sRGB transfer function that fits a response best: least squares over levels in log radiance.
+    pub(crate) fn exponent() -> [f64; COEFFICIENT_COUNT] {
+        let (mut sums, mut squares) = ([0.0; COEFFICIENT_COUNT], 0.0);
+        for v in (8..=248).map(|level| f64::from(level) / 255.0) {
+            let log = Self::srgb(v);
+            sums.iter_mut().zip(Self::basis(v)).for_each(|(sum, term)| *sum += term * log);
+            squares += log * log;
+        }
+        sums.map(|sum| sum / squares)
+    }
+
     /// Returns log₂ of the radiance of a level of 0 to 1 under the sRGB transfer function.
     pub(crate) fn srgb(v: f64) -> f64 {
         let v = v.max(MIN_LEVEL);

@@ -359,6 +359,7 @@ mod tests {
                 radius: eccentricity.clone(),
                 clipped: vec![false; eccentricity.len()],
                 eccentricity,
+                mean_level: 0.0,
             }
         };
         Preview { step: 1, width: SIZE.0, height: SIZE.1, pieces: vec![piece(0, 120, 70), piece(40, 160, 82)] }

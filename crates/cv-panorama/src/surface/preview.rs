@@ -27,6 +27,8 @@ pub(crate) struct Piece {
     pub(crate) radius: Vec<f32>,
     /// Whether the photograph is clipped in a channel.
     pub(crate) clipped: Vec<bool>,
+    /// Mean level of the photograph's samples.
+    pub(crate) mean_level: f64,
 }
 
 impl Piece {
@@ -56,6 +58,7 @@ impl Piece {
             eccentricity: at_corners(&self.eccentricity),
             radius: at_corners(&self.radius),
             clipped: clipped.collect(),
+            mean_level: self.mean_level,
         }
     }
 }
@@ -135,7 +138,9 @@ impl Preview {
             stage.add(1)?;
             let pixels = warped.pixels.as_slice().as_chunks::<4>().0.iter();
             let clipped = pixels.map(|p| p[..3].iter().any(|v| *v >= SATURATED_LEVEL)).collect();
-            Ok(Some(Piece { warped, eccentricity, radius, clipped }))
+            let samples = photo.as_slice();
+            let mean_level = samples.iter().map(|v| u64::from(*v)).sum::<u64>() as f64 / samples.len().max(1) as f64;
+            Ok(Some(Piece { warped, eccentricity, radius, clipped, mean_level }))
         };
         let pieces: Vec<Option<Piece>> =
             layout.placements.par_iter().enumerate().map(draw).collect::<Result<_, Cancelled>>()?;
@@ -278,6 +283,7 @@ mod tests {
             eccentricity: numbered.clone(),
             radius: numbered,
             clipped: (0..35).map(|i| i == 8).collect(),
+            mean_level: 0.0,
         };
         let half = piece.halved();
         assert_eq!(half.warped.bounds, Bounds { left: 2, top: 1, right: 5, bottom: 3 });
@@ -299,6 +305,7 @@ mod tests {
             eccentricity: vec![0.0],
             radius: vec![0.0],
             clipped: vec![false],
+            mean_level: 9.0,
         }
         .halved();
         assert!(half.warped.pixels.is_empty() && half.radius.is_empty());
