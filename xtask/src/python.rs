@@ -11,7 +11,7 @@ const MIN_PYTHON: (u32, u32) = (3, 10);
 /// Platform tag of a wheel for every Linux with glibc 2.17 or later: maturin assigns it only if no newer symbol is used.
 const MIN_LINUX_TAG: &str = "manylinux_2_17";
 
-/// Builds the wheel and runs `python/tests` on it: in the test profile, which reuses compiled crates, or in the release profile, on Linux against an old libc by zig.
+/// Builds the wheel and the program and runs `python/tests` on them: in the test profile, which reuses compiled crates, or in the release profile, on Linux against an old libc by zig.
 /// Prints a message and succeeds if this machine has no suitable Python.
 pub(crate) fn run(release: bool) -> Result<bool> {
     let (python, target) = (std::env::var("CV_PYTHON").unwrap_or_else(|_| "python3".to_owned()), target_dir()?);
@@ -63,15 +63,24 @@ pub(crate) fn run(release: bool) -> Result<bool> {
         println!("python: some peers could not be installed");
     }
     peers::check(pip(&["--no-deps"]).arg(wheel))?;
-    let program = target.join("debug").join(format!("cv{}", std::env::consts::EXE_SUFFIX));
+    let program = built_program(release, &target)?;
     let mut tests = Command::new(&interpreter);
     tests.args(["-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider"]).arg(sources.join("tests")).current_dir(&folder);
-    tests.env("EPIPOLE_FIXTURES", root().join("fixtures"));
-    if program.is_file() {
-        tests.env("EPIPOLE_PROGRAM", program);
-    }
+    tests.env("EPIPOLE_FIXTURES", root().join("fixtures")).env("EPIPOLE_PROGRAM", program);
     let status = tests.status().context("pytest")?;
     Ok(status.success())
+}
+
+/// Builds the program, with which the tests compare the package, in the profile of the wheel, and returns its path. Its features are those of the whole workspace, as in `.ci/run`.
+fn built_program(release: bool, target: &Path) -> Result<PathBuf> {
+    let mut build = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    build.args(["build", "--quiet", "--locked", "--workspace", "--features", "cv-pipeline/serde", "--bin", "cv"]);
+    if release {
+        build.arg("--release");
+    }
+    peers::check(build.env("CARGO_TARGET_DIR", target).current_dir(root()))?;
+    let profile = if release { "release" } else { "debug" };
+    Ok(target.join(profile).join(format!("cv{}", std::env::consts::EXE_SUFFIX)))
 }
 
 /// Returns whether a Python is free-threaded.

@@ -530,7 +530,7 @@ mod tests {
     fn defaults_change_nothing_where_nothing_is_to_be_done() {
         let set = Set::three();
         let panorama = set.render(&CompositingOptions::default());
-        // The canvas is brighter than every photograph, since the dark part of the sky is in two of them; its mean is reduced to that of the brightest.
+        // The canvas is brighter than every photograph, since overlaps count once; its mean is reduced to that of the brightest.
         let mean =
             |image: &RgbU8| image.as_slice().iter().map(|v| f64::from(*v)).sum::<f64>() / image.as_slice().len() as f64;
         let shown = mean_of_sky(&panorama);
