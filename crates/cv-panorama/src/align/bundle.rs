@@ -5,7 +5,7 @@
 //! residuals are the symmetric transfer errors in pixels. Updates are `M ← (I + Σ δ_k G_k) M` with the three generators `G_k` of rotations,
 //! or eight of homographies.
 
-use cv_core::{Distortion, Point2};
+use cv_core::Distortion;
 use cv_numeric::RobustLoss;
 use cv_numeric::adjust::{
     AdjustError, AdjustOptions, AdjustReport, Adjustment, Euclidean, GroupId, Manifold, Prior, Residual,
@@ -63,20 +63,27 @@ impl Lens {
         Distortion::simple_radial(self.k1)
     }
 
-    /// Undistorts a pixel to normalized coordinates; `None` outside the range of the distortion model.
-    fn ray(&self, pixel: Vector2<f64>) -> Option<Point2<f64>> {
-        let q = Point2::from(pixel / self.log_focal.exp());
+    /// Undistorts a pixel, divided by the focal length, to normalized coordinates; `None` outside the range of the distortion model.
+    #[inline]
+    fn normalize(&self, q: Vector2<f64>) -> Option<Vector2<f64>> {
         let p = if self.k1 == 0.0 { q } else { self.undistort(q) };
         p.x.is_finite().then_some(p)
     }
 
+    /// Returns the factor `1 + k₁ r²` of normalized coordinates, which distorts them, and the slope `1 + 3 k₁ r²` of the distorted radius.
+    #[inline]
+    fn radial(&self, r2: f64) -> (f64, f64) {
+        (1.0 + self.k1 * r2, 1.0 + 3.0 * self.k1 * r2)
+    }
+
     /// Solves for the radius by Newton's method; as [`Distortion::undistort`], in a fraction of the time.
-    fn undistort(&self, q: Point2<f64>) -> Point2<f64> {
-        let distorted = q.coords.norm();
+    #[inline]
+    fn undistort(&self, q: Vector2<f64>) -> Vector2<f64> {
+        let distorted = q.norm();
         let mut radius = distorted;
         for _ in 0..MAX_NEWTON_STEPS {
-            let (square, slope) = (radius * radius, 1.0 + 3.0 * self.k1 * radius * radius);
-            let error = radius * (1.0 + self.k1 * square) - distorted;
+            let (factor, slope) = self.radial(radius * radius);
+            let error = radius * factor - distorted;
             if slope <= 0.0 {
                 break;
             }
@@ -86,7 +93,7 @@ impl Lens {
             radius -= error / slope;
         }
         // Near the limit of its range, or beyond.
-        self.distortion().undistort(q)
+        self.distortion().undistort(q.into()).coords
     }
 }
 
@@ -126,13 +133,14 @@ const INVALID_RESIDUAL_PX: f64 = 1e4;
 /// Transfer errors of matches: parameters are the motions of source and target (`M` degrees of freedom each) and their intrinsics.
 struct Transfers<const M: usize, const C: usize> {
     kind: Motion,
-    generators: [Matrix3<f64>; M],
     matches: Vec<(Vector2<f64>, Vector2<f64>)>,
 }
 
 impl<const M: usize, const C: usize> Residual<2, 4, C> for Transfers<M, C> {
     const DIMS: [usize; 4] = [M, M, 2, 2];
 
+    /// The distortion is radial, so that all derivatives are in closed form: that of the distorted point `n (1 + k₁ r²)` is `(1 + k₁ r²) I + 2 k₁ n nᵀ`, and its inverse applied to `n` itself divides it
+    /// by the slope `1 + 3 k₁ r²`.
     #[inline]
     fn evaluate(
         &self,
@@ -144,37 +152,64 @@ impl<const M: usize, const C: usize> Residual<2, 4, C> for Transfers<M, C> {
         let [from, to] = [from, to].map(|l| Lens { log_focal: l[0], k1: l[1] });
         let relative = Matrix3::from_column_slice(target) * inverse(self.kind, &Matrix3::from_column_slice(source));
         let invalid = Some(Vector2::new(INVALID_RESIDUAL_PX, 0.0));
-        let Some(p) = from.ray(a) else { return invalid };
-        let x = p.to_homogeneous();
+        let Some(p) = from.normalize(a / from.log_focal.exp()) else { return invalid };
+        let x = p.push(1.0);
         let y = relative * x;
-        let Some(projected) = project(&y, to) else { return invalid };
-        let Some(j) = jacobian else { return Some(projected - b) };
-        let n = Point2::new(y.x / y.z, y.y / y.z);
         let f = to.log_focal.exp();
-        let (_, by_n, by_lens) = to.distortion().distort_with_jacobians(n);
-        let by_y = |dy: Vector3<f64>| by_n * Vector2::new(dy.x - n.x * dy.z, dy.y - n.y * dy.z) * (f / y.z);
-        for (k, g) in self.generators.iter().enumerate() {
-            j.set_column(k, &by_y(-(relative * (g * x))));
-            j.set_column(M + k, &by_y(g * y));
+        let Some((n, factor)) = project(&y, to) else { return invalid };
+        let projected = n * (factor * f);
+        let Some(j) = jacobian else { return Some(projected - b) };
+        let (scale, bend) = (f / y.z, 2.0 * to.k1);
+        let by_y = |dy: Vector3<f64>| {
+            let d = Vector2::new(dy.x - n.x * dy.z, dy.y - n.y * dy.z);
+            (d * factor + n * (bend * n.dot(&d))) * scale
+        };
+        for k in 0..M {
+            let (by_source, by_target) = match self.kind {
+                Motion::Rotation => (y.cross(&relative.column(k)), cross(k, &y)),
+                Motion::Homography => {
+                    let mut moved = Vector3::zeros();
+                    moved[k / 3] = y[k % 3];
+                    (relative.column(k / 3) * -x[k % 3], moved)
+                }
+            };
+            j.set_column(k, &by_y(by_source));
+            j.set_column(M + k, &by_y(by_target));
         }
-        let (q, by_p, by_k1) = from.distortion().distort_with_jacobians(p);
-        let Some(inverse_lens) = by_p.try_inverse() else { return invalid };
-        let by_ray = |dp: Vector2<f64>| by_y(relative * Vector3::new(dp.x, dp.y, 0.0));
-        j.set_column(2 * M, &by_ray(-(inverse_lens * q.coords)));
-        j.set_column(2 * M + 1, &by_ray(-(inverse_lens * by_k1.column(0))));
+        let r2 = p.norm_squared();
+        let (stretch, slope) = from.radial(r2);
+        if slope <= 0.0 {
+            return invalid;
+        }
+        // Of the ray by its own scale.
+        let by_ray = by_y(relative * p.push(0.0)) / -slope;
+        j.set_column(2 * M, &(by_ray * stretch));
+        j.set_column(2 * M + 1, &(by_ray * r2));
         j.set_column(2 * M + 2, &projected);
-        j.set_column(2 * M + 3, &(by_lens.column(0) * f));
+        j.set_column(2 * M + 3, &(n * (n.norm_squared() * f)));
         Some(projected - b)
     }
 }
 
-/// Projects a ray to pixels relative to the principal point; `None` behind the camera and outside the monotonic range of the distortion.
-fn project(y: &Vector3<f64>, lens: Lens) -> Option<Vector2<f64>> {
+/// Returns the cross product of the unit vector along axis `k` and `y`.
+#[inline]
+fn cross(k: usize, y: &Vector3<f64>) -> Vector3<f64> {
+    match k {
+        0 => Vector3::new(0.0, -y.z, y.y),
+        1 => Vector3::new(y.z, 0.0, -y.x),
+        _ => Vector3::new(-y.y, y.x, 0.0),
+    }
+}
+
+/// Projects a ray to normalized coordinates and the factor that distorts them; `None` behind the camera and outside the monotonic range of the distortion.
+#[inline]
+fn project(y: &Vector3<f64>, lens: Lens) -> Option<(Vector2<f64>, f64)> {
     if y.z <= 1e-6 * y.norm() {
         return None;
     }
-    let n = Point2::new(y.x / y.z, y.y / y.z);
-    lens.distortion().distort_in_range(n).map(|d| d.coords * lens.log_focal.exp())
+    let n = y.xy() / y.z;
+    let (factor, slope) = lens.radial(n.norm_squared());
+    (slope > 0.0).then_some((n, factor))
 }
 
 fn inverse(kind: Motion, m: &Matrix3<f64>) -> Matrix3<f64> {
@@ -184,24 +219,13 @@ fn inverse(kind: Motion, m: &Matrix3<f64>) -> Matrix3<f64> {
     }
 }
 
-fn generators_of_rotations() -> [Matrix3<f64>; 3] {
-    std::array::from_fn(|k| Vector3::ith(k, 1.0).cross_matrix())
-}
-
-/// All entries but the last: homographies are defined up to scale.
-fn generators_of_homographies() -> [Matrix3<f64>; 8] {
-    std::array::from_fn(|k| {
-        let mut g = Matrix3::zeros();
-        g[(k / 3, k % 3)] = 1.0;
-        g
-    })
-}
-
 impl Problem<'_> {
     /// Transfers a pixel of photograph `i` to photograph `j`, both relative to the principal points.
     pub(crate) fn transfer(&self, s: &State, i: usize, j: usize, a: Vector2<f64>) -> Option<Vector2<f64>> {
         let (from, to) = (s.lenses[self.lens_of[i]], s.lenses[self.lens_of[j]]);
-        project(&(s.motion[j] * inverse(self.kind, &s.motion[i]) * from.ray(a)?.to_homogeneous()), to)
+        let ray = from.normalize(a / from.log_focal.exp())?.push(1.0);
+        let (n, factor) = project(&(s.motion[j] * inverse(self.kind, &s.motion[i]) * ray), to)?;
+        Some(n * (factor * to.log_focal.exp()))
     }
 
     /// Minimizes the transfer errors from `start`; returns the state and its cost. A start that is not finite is returned with infinite cost.
@@ -221,12 +245,12 @@ impl Problem<'_> {
         let motions = match self.kind {
             Motion::Rotation => {
                 let motions = problem.add_group("rotations", RotationManifold, numbers)?;
-                self.add_matches::<3, 10>(&mut problem, motions, lenses, generators_of_rotations())?;
+                self.add_matches::<3, 10>(&mut problem, motions, lenses)?;
                 motions
             }
             Motion::Homography => {
                 let motions = problem.add_group("homographies", HomographyManifold, numbers)?;
-                self.add_matches::<8, 20>(&mut problem, motions, lenses, generators_of_homographies())?;
+                self.add_matches::<8, 20>(&mut problem, motions, lenses)?;
                 motions
             }
         };
@@ -263,7 +287,6 @@ impl Problem<'_> {
         problem: &mut Adjustment<'_>,
         motions: GroupId,
         lenses: GroupId,
-        generators: [Matrix3<f64>; M],
     ) -> Result<(), AdjustError> {
         let (mut matches, mut blocks) = (Vec::new(), Vec::new());
         for o in self.overlaps {
@@ -273,7 +296,7 @@ impl Problem<'_> {
                 blocks.extend([[i, j, from, to], [j, i, to, from]]);
             }
         }
-        let transfers = Transfers::<M, C> { kind: self.kind, generators, matches };
+        let transfers = Transfers::<M, C> { kind: self.kind, matches };
         problem.add_residuals("matches", transfers, [motions, motions, lenses, lenses], blocks, self.loss)
     }
 
@@ -367,11 +390,9 @@ mod tests {
         assert!(matches.len() > 20);
         let motions = [overlap.i, overlap.j]
             .map(|i| (Rotation3::new(Vector3::new(0.01, -0.02, 0.01)) * rotations[i]).into_inner());
-        let generators = generators_of_rotations();
-        let transfers = Transfers::<3, 10> { kind: Motion::Rotation, generators, matches: matches.clone() };
+        let transfers = Transfers::<3, 10> { kind: Motion::Rotation, matches: matches.clone() };
         check(&transfers, &RotationManifold, motions);
-        let generators = generators_of_homographies();
-        let transfers = Transfers::<8, 20> { kind: Motion::Homography, generators, matches };
+        let transfers = Transfers::<8, 20> { kind: Motion::Homography, matches };
         check(&transfers, &HomographyManifold, motions);
     }
 
