@@ -36,6 +36,8 @@ pub(crate) struct Frame<'a> {
     pub(crate) intensity_cap: Option<u8>,
     /// Gray levels of the left image, 0 to 255.
     pub(crate) gray: &'a [u8],
+    /// Gray levels of the row above, where the frame continues another one; its paths downwards then go on.
+    pub(crate) above: Option<&'a [u8]>,
     pub(crate) p1: u8,
     pub(crate) p2: &'a Penalties,
     /// Whether [`crate::winner::Winner::second`] is computed.

@@ -237,7 +237,10 @@ pub(crate) fn penalties<S: Simd, const PATHS: usize>(
     let last = width - 1;
     let row = |y: usize| &frame.gray[y * width..][..width];
     let here = row(y);
-    let before = row(if mirrored { (y + 1).min(height - 1) } else { y.saturating_sub(1) });
+    let before = match frame.above {
+        Some(above) if y == 0 && !mirrored => above,
+        _ => row(if mirrored { (y + 1).min(height - 1) } else { y.saturating_sub(1) }),
+    };
     let between = |a: &[u8], b: &[u8], out: &mut [u8]| frame.p2.between(simd, a, b, out);
     // From the left and from the right, in image order.
     let left = |b: &[u8], out: &mut [u8]| between(&here[1..], &b[..last], &mut out[1..]);

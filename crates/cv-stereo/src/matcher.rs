@@ -10,7 +10,7 @@ use crate::edge_preserving::{SmoothingBuffers, smooth};
 use crate::input::to_gray;
 use crate::layout::Layout;
 use crate::local_expansion;
-use crate::matcher_memory::STRIP_OVERLAP;
+use crate::matcher_memory::ROWS_BELOW_STRIP;
 use crate::search_window::SearchWindows;
 use crate::sequence;
 use crate::sgm::Aggregator;
@@ -254,7 +254,7 @@ impl StereoMatcher {
         let layout = self.layout(width, height);
         match self.strip_rows(width, height, self.coarse_memory(width, height)) {
             None => self.aggregator.prepare(width, height, layout, progress),
-            Some(rows) => self.strip.prepare(width, (rows + 2 * STRIP_OVERLAP).min(height), layout, progress),
+            Some(rows) => self.strip.prepare(width, rows, layout, progress),
         }
     }
 
@@ -369,9 +369,10 @@ impl StereoMatcher {
         let stride = planes * layout.right_row(width);
         let p2 = Penalties::new(options);
         let rows = self.strip_rows(width, height, self.coarse_memory(width, height));
-        let strips = rows.map_or(1, |rows| height.div_ceil(rows));
-        // Each row twice, and the overlap of strips.
-        let stage = Stage::new(progress, "aggregate", 2 * (height + 2 * STRIP_OVERLAP * (strips - 1)))?;
+        let ends = (0..height).step_by(rows.unwrap_or(height).max(1)).skip(1);
+        // Each row twice, and once those below a strip.
+        let swept = 2 * height + ends.map(|end| (height - end).min(ROWS_BELOW_STRIP)).sum::<usize>();
+        let stage = Stage::new(progress, "aggregate", swept)?;
         let frame = |rows: Range<usize>| Frame {
             width,
             height: rows.len(),
@@ -386,6 +387,7 @@ impl StereoMatcher {
             masks: self.borders.masks(rows.start),
             intensity_cap: (options.intensity_cost != IntensityCost::None).then(|| options.intensity_cost.cap()),
             gray: &self.gray8[rows.start * width..rows.end * width],
+            above: rows.start.checked_sub(1).map(|y| &self.gray8[y * width..][..width]),
             p1: options.p1,
             p2: &p2,
             second: options.confidence || options.uniqueness > 0,
@@ -400,20 +402,18 @@ impl StereoMatcher {
             let (windows, buffers) = (&self.windows, &mut self.window_sweeps);
             return window_sweep::aggregate(self.level, &frame, windows, buffers, (winners, right), &stage);
         }
-        let run = |aggregator: &mut Aggregator, rows: Range<usize>| -> Result<(), Cancelled> {
-            aggregator.run(self.level, &frame(rows), eight, &stage)
+        let Some(rows) = rows else {
+            return self.aggregator.run(self.level, &frame(0..height), height, eight, &stage);
         };
-        let Some(rows) = rows else { return run(&mut self.aggregator, 0..height) };
         let Aggregator { winners, right, .. } = &mut self.aggregator;
         winners.resize(width * height, Winner::default());
         right.resize(width * height, 0);
         for start in (0..height).step_by(rows) {
             let end = (start + rows).min(height);
-            let from = start.saturating_sub(STRIP_OVERLAP);
-            run(&mut self.strip, from..(end + STRIP_OVERLAP).min(height))?;
-            let inside = (start - from) * width..(end - from) * width;
-            winners[start * width..end * width].copy_from_slice(&self.strip.winners[inside.clone()]);
-            right[start * width..end * width].copy_from_slice(&self.strip.right[inside]);
+            let frame = frame(start..(end + ROWS_BELOW_STRIP).min(height));
+            self.strip.run(self.level, &frame, end - start, eight, &stage)?;
+            winners[start * width..end * width].copy_from_slice(&self.strip.winners);
+            right[start * width..end * width].copy_from_slice(&self.strip.right);
         }
         Ok(())
     }

@@ -10,13 +10,13 @@ use crate::{
 };
 use cv_core::Progress;
 
-/// Rows by which strips overlap: aggregation paths that start farther away hardly change the sums.
-pub(crate) const STRIP_OVERLAP: usize = 32;
+/// Rows below a strip at which its paths upwards start: those that start farther away hardly change the sums. (The paths downwards go on from strip to strip.)
+pub(crate) const ROWS_BELOW_STRIP: usize = 64;
 
 /// Limits that are tried until one suffices; each has room for one more of the coarser levels than the last.
 const MAX_LIMIT_TRIALS: usize = 8;
 
-/// Fewest rows of a strip: lower ones would mostly repeat the overlap.
+/// Fewest rows of a strip: lower ones would mostly repeat the rows below.
 const MIN_STRIP_ROWS: usize = 32;
 
 impl StereoMatcher {
@@ -40,7 +40,7 @@ impl StereoMatcher {
         let options = self.options();
         let pixels = width.saturating_mul(height);
         let planes = planes(options.census, options.intensity_cost);
-        let strip = if rows < height { (rows + 2 * STRIP_OVERLAP).min(height) } else { 0 };
+        let strip = if rows < height { rows } else { 0 };
         let whole = if rows < height { 0 } else { height };
         // Gray of both views in 16 bits, of one in 8; winners of both views; labels, scratch and outputs.
         let fixed = 5 + planes + size_of::<Winner>() + size_of::<u16>() + 8 + 4 + 5 + size_of::<Prior>();

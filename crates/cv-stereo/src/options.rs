@@ -218,9 +218,10 @@ pub struct StereoOptions {
     pub sequence: bool,
     /// Whether [`crate::StereoMatcher::confidence`] is computed: the second best match takes a tenth of the time. Default false.
     pub confidence: bool,
-    /// Maximum number of bytes of the matcher; `None` sets no limit. If the whole image does not fit, costs are aggregated in strips of rows
-    /// that overlap by 32: about 0.1 % of the pixels then differ by more than half a pixel from the result without the limit, up to 0.5 % with
-    /// the lowest limits, under which the coarser levels are in strips too. Default `None`. See [`crate::StereoMatcher::memory`].
+    /// Maximum number of bytes of the matcher; `None` sets no limit. If the whole image does not fit, costs are aggregated in strips of rows: their
+    /// paths downwards are those of the whole image, their paths upwards start 64 rows below. Of 21 pairs of Middlebury 0.03 % of the pixels
+    /// then differ by more than half a pixel from the result without the limit, of the worst pair 0.6 %. Default `None`. See
+    /// [`crate::StereoMatcher::memory`].
     pub max_memory: Option<usize>,
 }
 

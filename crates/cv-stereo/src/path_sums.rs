@@ -96,6 +96,7 @@ impl PathSums {
             given: Some(self.costs.as_mut_slice()),
             intensity_cap: None,
             gray: &self.gray,
+            above: None,
             p1: self.options.p1,
             p2: &self.p2,
             second: false,

@@ -238,6 +238,7 @@ mod tests {
                 left: &left,
                 right: &right,
                 gray: &gray,
+                above: None,
                 given: None,
                 priors: self.priors,
                 masks: self.masks,
@@ -318,12 +319,53 @@ mod tests {
                     // Twice, so that state left by a frame would show.
                     for _ in 0..2 {
                         let stage = cv_core::Stage::new(&cv_core::Silent, "", 0).unwrap();
-                        aggregator.run(level, frame, options.paths == Paths::Eight, &stage).unwrap();
+                        aggregator.run(level, frame, height, options.paths == Paths::Eight, &stage).unwrap();
                         assert_eq!(aggregator.winners, pair.expected.0, "{level:?}");
                         assert_eq!(aggregator.right, pair.expected.1, "{level:?}");
                     }
                 });
             }
+        }
+
+        #[test]
+        fn strips_with_all_rows_below_have_the_winners_of_the_reference(
+            options in options(),
+            width in 9usize..40,
+            height in 7usize..24,
+            strip in 1usize..12,
+            seed in any::<u64>(),
+            has_masks in any::<bool>(),
+        ) {
+            let noise = |i: usize| ((seed.wrapping_add(i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40) as u16 % 5) * 13_107;
+            let left: Vec<u16> = (0..width * height).map(noise).collect();
+            let right: Vec<u16> = (0..width * height).map(|i| noise(i + 3)).collect();
+            let prior = |i: usize| Prior::new((noise(i + 11) as usize * 31 % options.disparities) as u16, (noise(i + 5) % 4) as u8);
+            let priors: Vec<Prior> = (0..width * height).map(prior).collect();
+            let borders = [0, 77].map(|salt| masks(width, height, has_masks, |i| noise(i + salt)));
+            let masks = PairMasks { left: borders[0].as_ref(), right: borders[1].as_ref(), first: 0 };
+            let pair = Pair::new(&options, &[left, right], width, &priors, masks);
+            let level = Level::new();
+            let (mut aggregator, mut winners, mut chosen) = (Aggregator::default(), Vec::new(), Vec::new());
+            pair.with_frame(level, Layout::new(level, options.disparities), |frame| {
+                let stage = cv_core::Stage::new(&cv_core::Silent, "", 0).unwrap();
+                for first in (0..height).step_by(strip) {
+                    let below = Frame {
+                        height: height - first,
+                        left: &frame.left[first * frame.left.len() / height..],
+                        right: &frame.right[first * frame.right.len() / height..],
+                        gray: &frame.gray[first * width..],
+                        above: first.checked_sub(1).map(|y| &frame.gray[y * width..][..width]),
+                        priors: &frame.priors[first * width..],
+                        masks: PairMasks { first, ..frame.masks },
+                        ..*frame
+                    };
+                    aggregator.run(level, &below, strip.min(height - first), options.paths == Paths::Eight, &stage).unwrap();
+                    winners.extend_from_slice(&aggregator.winners);
+                    chosen.extend_from_slice(&aggregator.right);
+                }
+            });
+            prop_assert_eq!(winners, pair.expected.0);
+            prop_assert_eq!(chosen, pair.expected.1);
         }
 
         #[test]

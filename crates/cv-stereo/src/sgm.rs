@@ -58,21 +58,24 @@ impl Aggregator {
         })
     }
 
-    /// Computes [`Aggregator::winners`] and [`Aggregator::right`]. Reports two units of progress per row.
+    /// Computes [`Aggregator::winners`] and [`Aggregator::right`] of the first `rows` rows of the frame. In the rows below, only the paths upwards are followed. A frame with a row
+    /// [`above`](Frame::above) continues the last one, below its `rows`. Reports two units of progress per row, one per row below.
     pub(crate) fn run(
         &mut self,
         level: Level,
         frame: &Frame<'_>,
+        rows: usize,
         eight: bool,
         stage: &Stage<'_>,
     ) -> Result<(), Cancelled> {
-        let (width, height) = (frame.width, frame.height);
+        let width = frame.width;
         let depth = frame.layout.depth;
-        self.resize(width, height, depth);
+        self.resize(width, rows, depth);
         let [down, up] = &mut self.sweeps;
         // Rows of the upper half, swept first by `down` and last by `up`.
-        let top = height / 2;
-        let bottom = height - top;
+        let top = rows / 2;
+        let bottom = rows - top;
+        let below = frame.height - rows;
         let (sums_top, sums_bottom) = self.sums.as_mut_slice().split_at_mut(top * width * depth);
         let (winners_top, winners_bottom) = self.winners.split_at_mut(top * width);
         let (right_top, right_bottom) = self.right.split_at_mut(top * width);
@@ -81,12 +84,19 @@ impl Aggregator {
         };
         let (one, other) = rayon::join(
             || {
-                down.start(frame, false);
+                if frame.above.is_none() {
+                    down.start(frame, false);
+                }
                 run(down, 0, top, Output::Store(sums_top))
             },
             || {
                 up.start(frame, true);
-                run(up, 0, bottom, Output::Store(sums_bottom))
+                // The sums of the rows below are not used: they are overwritten.
+                for first in (0..below).step_by(bottom.max(1)) {
+                    let steps = bottom.min(below - first);
+                    run(up, first, steps, Output::Store(&mut sums_bottom[..steps * width * depth]))?;
+                }
+                run(up, below, bottom, Output::Store(sums_bottom))
             },
         );
         one.and(other)?;
@@ -99,7 +109,7 @@ impl Aggregator {
                     Output::Finish { other: sums_bottom, winners: winners_bottom, right: right_bottom },
                 )
             },
-            || run(up, bottom, top, Output::Finish { other: sums_top, winners: winners_top, right: right_top }),
+            || run(up, below + bottom, top, Output::Finish { other: sums_top, winners: winners_top, right: right_top }),
         );
         one.and(other)
     }
