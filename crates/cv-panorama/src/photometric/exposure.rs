@@ -182,8 +182,8 @@ pub(crate) fn estimate_gains(
 /// Maximum number of preview pixels sampled for the mean level.
 const MAX_MEAN_SAMPLES: usize = 10_000;
 
-/// Margin in gray levels by which the mean level of the panorama stays inside the range of the photographs' means: blending and rounding change it by a tenth.
-const MEAN_MARGIN: f64 = 0.25;
+/// Margin in gray levels by which the mean level of the panorama stays inside the range of the photographs' means: of photographs with parallax, the choice at the seams changes it by up to one.
+const MEAN_MARGIN: f64 = 1.0;
 
 /// Chooses the common exposure, which the overlaps leave free: the mean level of the panorama is kept at that of the photographs, clamped to the range of their means. Each canvas
 /// position counts once, with the mean of the photographs that cover it. (Where several photographs cover the dark parts of a scene and one the bright parts, that exceeds the mean of every photograph.)
