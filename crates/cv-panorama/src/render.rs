@@ -225,7 +225,7 @@ pub(crate) fn draw<T: PhotoSample>(
     let eight = EightBits::new(photos, "elastic", progress)?;
     let bytes = eight.views();
     let fields = if options.elastic {
-        displacements(&bytes, &layout, alignment, progress)?
+        displacements(&bytes, masks, &layout, alignment, progress)?
     } else {
         vec![None; layout.placements.len()]
     };

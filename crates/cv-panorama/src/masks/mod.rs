@@ -8,7 +8,7 @@ mod fill;
 mod placed;
 
 pub(crate) use fill::{Filled, filled};
-pub(crate) use placed::PlacedMasks;
+pub(crate) use placed::{PlacedMasks, is_removed, is_removed_near};
 
 use cv_core::Image;
 

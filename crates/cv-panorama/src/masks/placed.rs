@@ -5,7 +5,7 @@ use crate::bit_depth::Channel;
 use crate::regions::Region;
 use crate::rows::for_each_row;
 use crate::surface::{Bounds, DisplacementField, Layout, Map, Placement, Preview, PreviewScale, Surface, WarpedPhoto};
-use cv_core::{Cancelled, Image, Point2, Progress, Scaling, Stage};
+use cv_core::{Cancelled, Image, Point2, Progress, Scaling, Stage, Vector2};
 use rayon::prelude::*;
 
 /// The masks of the placements of a layout.
@@ -156,6 +156,29 @@ impl PreviewMasks {
             cleared.iter().for_each(|&i| pixels[i][3] = 0);
         }
     }
+}
+
+/// Returns whether placement `k` is removed at a canvas position, before displacement.
+pub(crate) fn is_removed(masks: &[Option<&PhotoMask>], layout: &Layout, k: usize, at: Point2<f64>) -> bool {
+    let placement = &layout.placements[k];
+    let Some(mask) = masks.get(placement.photo).copied().flatten() else { return false };
+    let pixel = placement.view.project(&layout.surface.inverse(at + placement.origin.coords));
+    pixel.is_some_and(|p| mask.around(p.x as f32, p.y as f32) == PhotoUse::Remove)
+}
+
+/// Returns whether placement `k` is removed anywhere in a square around a canvas position, of which every fourth pixel is tried.
+pub(crate) fn is_removed_near(
+    masks: &[Option<&PhotoMask>],
+    layout: &Layout,
+    k: usize,
+    at: Point2<f64>,
+    radius: usize,
+) -> bool {
+    if masks.get(layout.placements[k].photo).copied().flatten().is_none() {
+        return false;
+    }
+    let steps = || (0..=2 * radius).step_by(4).map(|i| i as f64 - radius as f64);
+    steps().any(|dy| steps().any(|dx| is_removed(masks, layout, k, at + Vector2::new(dx, dy))))
 }
 
 /// Positions in a photograph of canvas pixels, as [`warp`](crate::surface::warp) finds them.

@@ -229,7 +229,13 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
         let fields = if options.elastic {
             let each = grays.iter().flatten().map(|((w, h), _)| w * h).max().unwrap_or(1).max(1);
             let store = GrayStore::new(&scratch, grays, budget.work / 2 / each);
-            displacements_with(&|index| store.get(index).map_err(RenderError::from), &layout, alignment, &stage)?
+            displacements_with(
+                &|index| store.get(index).map_err(RenderError::from),
+                &masks,
+                &layout,
+                alignment,
+                &stage,
+            )?
         } else {
             vec![None; layout.placements.len()]
         };

@@ -1,9 +1,9 @@
-//! Masks of photographs with a known registration, and of their features.
+//! Masks of photographs with a known registration, and in registration.
 
 use super::order::Order;
 use super::{PanoramaError, PanoramaResult, composite, known_registration};
 use crate::Progress;
-use cv_core::{ImageView, Point2, Scaling};
+use cv_core::{GrayU8, ImageView, Point2, Scaling};
 use cv_features::Features;
 use cv_panorama::{CompositingOptions, PhotoMask, PhotoSample, PhotoUse, Registration, check_masks};
 
@@ -31,11 +31,23 @@ pub fn panorama_with_masks<T: PhotoSample>(
 
 /// Drops the features of removed pixels; their photograph is `factor` times as large as the image of the features.
 pub(super) fn drop_removed(features: &mut Features, mask: &PhotoMask, factor: f64) {
-    let scaling = Scaling::uniform(factor);
-    let is_free = |p: Point2<f32>| {
-        let p = scaling.point_f32(p);
-        mask.at(p.x.round().max(0.0) as usize, p.y.round().max(0.0) as usize) != PhotoUse::Remove
-    };
-    let keep: Vec<bool> = features.keypoints.iter().map(|k| is_free(k.position)).collect();
+    let keep: Vec<bool> = features.keypoints.iter().map(|k| !is_removed(k.position, mask, factor)).collect();
     features.retain(&keep);
+}
+
+/// Makes the removed pixels white: clipped ones, which [`cv_panorama::refine_alignment`] does not compare.
+pub(super) fn clip_removed(gray: &mut GrayU8, mask: &PhotoMask, factor: f64) {
+    for y in 0..gray.height() {
+        for (x, value) in gray.row_mut(y).iter_mut().enumerate() {
+            if is_removed(Point2::new(x as f32, y as f32), mask, factor) {
+                *value = u8::MAX;
+            }
+        }
+    }
+}
+
+/// Returns whether a position of an image is removed, of whose photograph this is the mask; that is `factor` times as large.
+fn is_removed(position: Point2<f32>, mask: &PhotoMask, factor: f64) -> bool {
+    let p = Scaling::uniform(factor).point_f32(position);
+    mask.at(p.x.round().max(0.0) as usize, p.y.round().max(0.0) as usize) == PhotoUse::Remove
 }

@@ -2,7 +2,7 @@
 
 use crate::Progress;
 use crate::matching::{MatchingOptions, correspondences, match_features, rescale};
-use crate::panorama::masked::drop_removed;
+use crate::panorama::masked::{clip_removed, drop_removed};
 use crate::panorama::{
     LeftOut, NearestPair, PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto,
 };
@@ -188,10 +188,14 @@ impl Prepared {
         Ok(())
     }
 
-    /// Rounds the luma to gray levels, and frees it.
+    /// Rounds the luma to gray levels, with the removed pixels clipped, and frees it.
     fn take_gray(&mut self) -> GrayU8 {
         let gray = std::mem::replace(&mut self.gray, GrayF32::new(0, 0, [0.0]));
-        cv_imgproc::f32_to_u8(gray.view())
+        let mut gray = cv_imgproc::f32_to_u8(gray.view());
+        if let Some(mask) = &self.mask {
+            clip_removed(&mut gray, mask, self.factor);
+        }
+        gray
     }
 
     /// Returns the features in pixels of the photograph.

@@ -69,6 +69,7 @@ fn what_is_removed_is_neither_matched_nor_shown() {
     }
     let result = join(&photos, Some(&mask())).unwrap();
     assert_eq!(features_on_the_bus(&result), 0);
+    println!("with masks: {} px", error(&result, &set));
     // As without the bus; a third of the features is left, which align a view within half a pixel.
     assert!(error(&result, &set) < 0.5, "{}", error(&result, &set));
     let (w, h) = result.size;
