@@ -172,7 +172,7 @@ mod tests {
                 continue;
             }
             // Of a ramp means of means keep the range around the hole; along its outline, the values beside it to within the step of a few pixels.
-            let edge = x < 22 || x >= 68 || y < 17 || y >= 43;
+            let edge = !(22..68).contains(&x) || !(17..43).contains(&y);
             let most = if edge { 12 } else { 60 };
             assert!(got[0].abs_diff(r) <= most && got[1].abs_diff(g) <= most && got[2] == b, "{x} {y} {got:?}");
         }
