@@ -408,6 +408,8 @@ def panorama(
     blend: Literal["multiband", "poisson", "feather", "none"] | None = "multiband",
     seams: Literal["graphcut", "voronoi"] | None = "graphcut",
     clean: bool | None = False,
+    keep: Sequence[_Mask | None] | None = None,
+    remove: Sequence[_Mask | None] | None = None,
     exposure: Literal["none", "match"] | None = "match",
     crop: bool | None = False,
     scale: float | None = 1.0,

@@ -57,6 +57,30 @@ def test_16_bit_photographs_give_a_16_bit_panorama():
         epipole.panorama([p.astype(np.float32) for p in photographs])
 
 
+def test_masks_remove_and_keep_parts_of_photographs():
+    photographs = [epipole.read_image(path) for path in VIEWS]
+    height, width = photographs[0].shape[:2]
+    # The middle of the middle photograph, of which its neighbors show a part each.
+    middle = np.zeros((height, width), bool)
+    middle[:, width // 4 : -width // 4] = True
+    found = epipole.panorama(photographs, remove=[None, middle, None])
+    registered = {"registration": found.registration, "scale": 0.5, "blend": "none"}
+    plain = epipole.panorama(photographs, **registered)
+    removed = epipole.panorama(photographs, remove=[None, middle, None], **registered)
+    kept = epipole.panorama(photographs, keep=[None, 255 * middle.astype(np.uint8)], **registered)
+    pixels = [int((p.labels == 1).sum()) for p in (removed, plain, kept)]
+    # Half of the photograph's width is removed, at a quarter of its pixels, less what lies beyond the seams.
+    assert pixels[0] < pixels[1] - width * height // 16 and pixels[2] >= width * height // 8 * 0.95, pixels
+    both = epipole.panorama(photographs, keep=[None, middle], remove=[None, middle], **registered)
+    assert np.array_equal(both.image, removed.image)
+    with pytest.raises(errors.EpipoleError, match="mask of photograph 1"):
+        epipole.panorama(photographs, keep=[None, middle[:-1]])
+    with pytest.raises(ValueError, match="4 masks for 3 photographs"):
+        epipole.panorama(photographs, remove=[None] * 4)
+    with pytest.raises(ValueError, match=r"keep\[0\] has"):
+        epipole.panorama(photographs, keep=[middle], remove=[middle.T])
+
+
 def test_a_field_of_view_is_rendered():
     whole = epipole.panorama(VIEWS, scale=0.5, projection="stereographic")
     part = epipole.panorama(VIEWS, scale=0.5, projection="stereographic", fov=(40, 30), center=(-3, 1), roll=2.0)

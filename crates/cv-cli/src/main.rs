@@ -3,6 +3,7 @@
 mod boards;
 mod commands;
 mod frame;
+mod masks;
 mod photos;
 mod pictures;
 mod rig;

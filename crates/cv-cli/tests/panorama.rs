@@ -553,3 +553,82 @@ fn layers_put_together_are_the_panorama_without_blending() {
     let usage = [&args[..6], &["--layers", "layers", "--blend", "poisson"]].concat();
     assert_eq!(run(folder.path(), &usage).code, Some(2));
 }
+
+/// A landscape in three photographs; in the second, a red post that the first does not show.
+fn with_post(folder: &Path) -> Vec<String> {
+    let (_, names) = landscape(folder, 3, 0.0);
+    let photo = cv_io::read_rgb(folder.join(&names[1])).unwrap();
+    let is_post = |x: usize, y: usize| (100..140).contains(&x) && (120..260).contains(&y);
+    let painted = RgbU8::from_fn(420, 300, |x, y| if is_post(x, y) { [255, 0, 0] } else { photo.at(x, y) });
+    cv_io::write_png(folder.join(&names[1]), painted.view()).unwrap();
+    let mask = RgbU8::from_fn(420, 300, |x, y| [if is_post(x, y) { 255 } else { 0 }; 3]);
+    cv_io::write_png(folder.join("1_mask.png"), mask.view()).unwrap();
+    names
+}
+
+fn red_pixels(image: &RgbU8) -> usize {
+    image.pixels().filter(|p| p[0] > 180 && p[1] < 60 && p[2] < 60).count()
+}
+
+#[test]
+fn masks_are_found_by_name_and_remove_or_keep() {
+    let folder = tempfile::tempdir().unwrap();
+    let names = with_post(folder.path());
+    let made = |images: &[&str], more: &[&str]| {
+        let args: Vec<&str> = ["panorama"].iter().chain(images).chain(&["-o", "p.png"]).chain(more).copied().collect();
+        let value = json(folder.path(), &args);
+        assert_eq!(value["images"].as_array().unwrap().len(), 3, "{value}");
+        cv_io::read_rgb(folder.path().join("p.png")).unwrap()
+    };
+    let set: Vec<&str> = strs(&names);
+    let removed = made(&set, &["--remove", "1_mask.png"]);
+    let kept = made(&set, &["--keep", "1_mask.png"]);
+    // 40 by 140 pixels, most of them unblended red.
+    assert!(red_pixels(&removed) == 0 && red_pixels(&kept) > 4000, "{} {}", red_pixels(&removed), red_pixels(&kept));
+    // A folder of masks, which may have the name of the photograph itself, and a limit of memory.
+    std::fs::create_dir(folder.path().join("masks")).unwrap();
+    std::fs::copy(folder.path().join("1_mask.png"), folder.path().join("masks/1.png")).unwrap();
+    assert!(made(&set, &["--remove", "masks", "--max-memory", "2000"]) == removed);
+    // A folder with photographs and their masks is both; the second option is stronger.
+    std::fs::create_dir(folder.path().join("all")).unwrap();
+    for name in set.iter().chain(&["1_mask.png"]) {
+        std::fs::copy(folder.path().join(name), folder.path().join("all").join(name)).unwrap();
+    }
+    assert!(made(&["all"], &["--keep", "masks/1.png", "--remove", "all"]) == removed);
+    // With a registration too.
+    done(folder.path(), &[&["panorama"], &set[..], &["-o", "q.png", "--save-registration", "r.json"]].concat());
+    let frame = made(&set, &["--registration", "r.json", "--remove", "masks"]);
+    assert_eq!(red_pixels(&frame), 0);
+}
+
+#[test]
+fn masks_that_fit_no_photograph_are_refused_by_name_and_size() {
+    let folder = tempfile::tempdir().unwrap();
+    let names = with_post(folder.path());
+    let mask = cv_io::read_rgb(folder.path().join("1_mask.png")).unwrap();
+    cv_io::write_png(folder.path().join("2_mask.png"), mask.view().crop(0, 0, 300, 300).unwrap()).unwrap();
+    for copy in ["7_mask.png", "more/1.png", "other/9.png"] {
+        std::fs::create_dir_all(folder.path().join(copy).parent().unwrap()).unwrap();
+        cv_io::write_png(folder.path().join(copy), mask.view()).unwrap();
+    }
+    let told = |more: &[&str]| {
+        let args: Vec<&str> =
+            ["panorama"].into_iter().chain(strs(&names)).chain(["-o", "p.png"]).chain(more.iter().copied()).collect();
+        let ran = refused(folder.path(), &args);
+        assert!(!folder.path().join("p.png").exists());
+        ran.stderr
+    };
+    let text = told(&["--remove", "2_mask.png"]);
+    assert!(text.contains("2.png has 420×300 pixels, its mask 2_mask.png has 300×300"), "{text}");
+    let text = told(&["--keep", "7_mask.png"]);
+    assert!(text.contains("7_mask.png is named as the mask of none of the photographs"), "{text}");
+    let text = told(&["--remove", "1_mask.png", "more"]);
+    assert!(text.contains("1_mask.png and more/1.png are both masks of 1.png"), "{text}");
+    let text = told(&["--remove", "other"]);
+    assert!(text.contains("no file in other is named as the mask of a photograph"), "{text}");
+    let text = told(&["--remove", "nowhere.png"]);
+    assert!(text.contains("nowhere.png"), "{text}");
+    // A mask is an input, which is not overwritten.
+    let args = [&["panorama"], &strs(&names)[..], &["-o", "1_mask.png", "--remove", "1_mask.png"]].concat();
+    assert!(refused(folder.path(), &args).stderr.contains("1_mask.png is an input"));
+}

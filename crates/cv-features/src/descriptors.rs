@@ -124,8 +124,8 @@ impl Features {
         self.keypoints.len() + self.dropped.len() + self.beyond_limit
     }
 
-    /// Retains the features for which `keep` is true.
-    pub(crate) fn retain(&mut self, keep: &[bool]) {
+    /// Retains the features for which `keep`, one flag per feature, is true.
+    pub fn retain(&mut self, keep: &[bool]) {
         let d = self.descriptors.dimension();
         let mut which = keep.iter();
         self.keypoints.retain(|_| which.next() == Some(&true));

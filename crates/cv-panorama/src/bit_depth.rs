@@ -5,6 +5,7 @@
 
 use crate::align::Alignment;
 use crate::blend::{BlendMode, Blender, of_mode};
+use crate::masks::PhotoMask;
 use crate::render::{CompositingOptions, Panorama, RenderError, draw};
 use crate::rows::for_each_row;
 use crate::stream::{MemoryLimit, PhotoSource, RowSink, draw_streamed};
@@ -95,6 +96,7 @@ pub trait Internals: Channel {
 
     fn draw(
         photos: &[ImageView<'_, Self, 3>],
+        masks: &[Option<&PhotoMask>],
         alignment: &Alignment,
         options: &CompositingOptions,
         blender: &dyn Blender<Self>,
@@ -160,12 +162,13 @@ macro_rules! compiled_here {
         #[inline(never)]
         fn draw(
             photos: &[ImageView<'_, Self, 3>],
+            masks: &[Option<&PhotoMask>],
             alignment: &Alignment,
             options: &CompositingOptions,
             blender: &dyn Blender<Self>,
             progress: &dyn Progress,
         ) -> Result<Panorama<Self>, RenderError> {
-            draw(photos, alignment, options, blender, progress)
+            draw(photos, masks, alignment, options, blender, progress)
         }
 
         #[inline(never)]

@@ -35,6 +35,7 @@
 mod align;
 mod bit_depth;
 mod blend;
+mod masks;
 mod photometric;
 mod regions;
 mod registration;
@@ -53,9 +54,10 @@ pub use bit_depth::{EightBits, PhotoSample};
 pub use blend::{BlendMode, Blender, Composition, NO_PHOTO};
 pub use cv_geometry::{PairRejection, VerifiedPair, VerifyOptions, verify_pair};
 pub use cv_imgproc::Interpolation;
+pub use masks::{PhotoMask, PhotoUse};
 pub use photometric::{Exposure, Gains};
 pub use registration::{Pto, PtoError, Registration, RegistrationError};
-pub use render::{CompositingOptions, Panorama, RenderError, render, render_with};
+pub use render::{CompositingOptions, Panorama, RenderError, check_masks, render, render_masked, render_with};
 pub use seams::Seams;
 pub use stream::{
     Layer, MemoryLimit, NotWritten, PhotoSource, RowSink, ScratchFile, StreamError, StreamedFrame, render_streamed,

@@ -3,6 +3,7 @@
 use crate::align::Alignment;
 use crate::bit_depth::{Channel, EightBits, PhotoSample};
 use crate::blend::{BlendMode, Blender, Composition, NO_PHOTO, of_mode};
+use crate::masks::{PhotoMask, PlacedMasks, filled};
 use crate::photometric::{
     Exposure, ExposureCorrection, Gains, Tone, decode_radiance, estimate_gains, fill_saturated, relative_gains,
 };
@@ -11,8 +12,8 @@ use crate::rows::for_each_row;
 use crate::seams::{self, Seams};
 use crate::stream::StreamError;
 use crate::surface::{
-    Bounds, Canvas, DisplacementField, Framing, Layout, LayoutError, PhotoMap, Placement, Preview, Projection,
-    WarpSettings, WarpedPhoto, displacements, downsampled_view, largest_rectangle, layout, warp,
+    Bounds, Canvas, DisplacementField, Framing, Layout, LayoutError, PhotoMap, Placement, Preview, PreviewScale,
+    Projection, WarpSettings, WarpedPhoto, displacements, downsampled_view, largest_rectangle, layout, warp,
 };
 use cv_core::{Cancelled, Image, ImageView, Mask, OptionError, Progress, RgbF32, Sample, Stage, StageClock};
 use cv_imgproc::{Interpolation, resize_area};
@@ -85,6 +86,20 @@ pub enum RenderError {
         /// The width that was aligned; 0 where no such photograph was.
         expected_width: usize,
         /// The height that was aligned.
+        expected_height: usize,
+    },
+    /// A mask does not have the size of its photograph.
+    #[error("the mask of photograph {index} is {width}x{height}, the photograph {expected_width}x{expected_height}")]
+    WrongMask {
+        /// Which.
+        index: usize,
+        /// Width of the mask.
+        width: usize,
+        /// Height of the mask.
+        height: usize,
+        /// Width of the photograph; 0 where there is none of this index.
+        expected_width: usize,
+        /// Height of the photograph.
         expected_height: usize,
     },
     /// The blender returned an image of another size than the canvas.
@@ -170,36 +185,63 @@ pub fn render_with<T: PhotoSample>(
     blender: &dyn Blender<T>,
     progress: &dyn Progress,
 ) -> Result<Panorama<T>, RenderError> {
-    T::draw(photos, alignment, options, blender, progress)
+    T::draw(photos, &[], alignment, options, blender, progress)
 }
 
-/// Implements [`render_with`].
+/// As [`render`], with the masks of the photographs; fewer than photographs where the last have none.
+///
+/// # Errors
+/// [`RenderError`].
+pub fn render_masked<T: PhotoSample>(
+    photos: &[ImageView<'_, T, 3>],
+    masks: &[Option<&PhotoMask>],
+    alignment: &Alignment,
+    options: &CompositingOptions,
+    progress: &dyn Progress,
+) -> Result<Panorama<T>, RenderError> {
+    T::draw(photos, masks, alignment, options, options.blend.blender(), progress)
+}
+
+/// Implements [`render_with`] and [`render_masked`].
 pub(crate) fn draw<T: PhotoSample>(
     photos: &[ImageView<'_, T, 3>],
+    masks: &[Option<&PhotoMask>],
     alignment: &Alignment,
     options: &CompositingOptions,
     blender: &dyn Blender<T>,
     progress: &dyn Progress,
 ) -> Result<Panorama<T>, RenderError> {
     let mut clock = StageClock::new();
-    check(|index| photos.get(index).map_or((0, 0), ImageView::size), alignment, options)?;
+    check(|index| photos.get(index).map_or((0, 0), ImageView::size), masks, alignment, options)?;
+    let filled = filled(photos, masks, progress)?;
+    let photos: Vec<ImageView<'_, T, 3>> = photos
+        .iter()
+        .enumerate()
+        .map(|(i, photo)| filled.get(i).and_then(Option::as_ref).map_or(*photo, Image::view))
+        .collect();
+    let photos = &photos[..];
     let layout = layout(alignment, options.projection, &options.framing, options.resolution, options.max_pixels)?;
     let photo_of: Vec<usize> = layout.placements.iter().map(|p| p.photo).collect();
     let eight = EightBits::new(photos, "elastic", progress)?;
     let bytes = eight.views();
     let fields = if options.elastic {
-        displacements(&bytes, &layout, alignment, progress)?
+        displacements(&bytes, masks, &layout, alignment, progress)?
     } else {
         vec![None; layout.placements.len()]
     };
     clock.lap("elastic");
     let mut preview = Preview::draw(&bytes, &layout, &fields, options.resolution, PREVIEW_PIXELS, progress)?;
     drop(eight);
+    let placed = PlacedMasks::new(masks, &layout, &fields);
+    let scale = PreviewScale::new(&layout, options.resolution, PREVIEW_PIXELS);
+    let masked = placed.on_preview(&preview, scale, progress)?;
+    masked.remove(&mut preview);
     clock.lap("preview");
     let gains = estimate_gains(&preview, &photo_of, photos.len(), options.exposure, progress)?;
     if options.exposure != Exposure::None {
         preview.correct(&gains, &photo_of);
     }
+    masked.keep(&mut preview);
     clock.lap("exposure");
     let coarse =
         seams::on_preview(&preview, &photo_of, options.seams, options.radiance, options.removes_transients, progress)?;
@@ -209,7 +251,7 @@ pub(crate) fn draw<T: PhotoSample>(
     // No canvas has more levels.
     let levels = blender.pyramid_levels(typical_side).min(16);
     let regions = regions(&coarse, &preview, &layout, levels);
-    let drawing = Drawing { layout: &layout, regions: &regions, fields: &fields, options };
+    let drawing = Drawing { layout: &layout, regions: &regions, fields: &fields, options, masks: &placed };
     let warped = drawing.warped(photos, &gains, progress)?;
     clock.lap("warp");
     let mut labels = {
@@ -272,9 +314,10 @@ pub(crate) fn draw<T: PhotoSample>(
     Ok(panorama)
 }
 
-/// Checks the sizes of the photographs and the options.
+/// Checks the sizes of the photographs and their masks, and the options.
 pub(crate) fn check(
     size_of_photo: impl Fn(usize) -> (usize, usize),
+    masks: &[Option<&PhotoMask>],
     alignment: &Alignment,
     options: &CompositingOptions,
 ) -> Result<(), RenderError> {
@@ -287,6 +330,23 @@ pub(crate) fn check(
             return Err(RenderError::WrongPhoto { index, width, height, expected_width, expected_height });
         }
     }
+    check_masks(size_of_photo, masks)
+}
+
+/// Checks the sizes of masks.
+///
+/// # Errors
+/// [`RenderError::WrongMask`].
+pub fn check_masks(
+    size_of_photo: impl Fn(usize) -> (usize, usize),
+    masks: &[Option<&PhotoMask>],
+) -> Result<(), RenderError> {
+    for (index, mask) in masks.iter().enumerate().filter_map(|(index, mask)| Some((index, (*mask)?))) {
+        let ((width, height), (expected_width, expected_height)) = (mask.size(), size_of_photo(index));
+        if (width, height) != (expected_width, expected_height) {
+            return Err(RenderError::WrongMask { index, width, height, expected_width, expected_height });
+        }
+    }
     Ok(())
 }
 
@@ -296,6 +356,7 @@ pub(crate) struct Drawing<'a> {
     pub(crate) regions: &'a [Option<Region>],
     pub(crate) fields: &'a [Option<DisplacementField>],
     pub(crate) options: &'a CompositingOptions,
+    pub(crate) masks: &'a PlacedMasks<'a>,
 }
 
 impl Drawing<'_> {
@@ -396,12 +457,16 @@ impl Drawing<'_> {
         let (shrink, interpolation) = (self.shrink(), self.options.interpolation);
         if shrink == 1 {
             let settings = WarpSettings { displacement: field, interpolation, correction, region };
-            return warp(photo, placement, &self.layout.surface, bounds, settings, stage);
+            let mut warped = warp(photo, placement, &self.layout.surface, bounds, settings, stage)?;
+            self.masks.clear(k, &mut warped, self.regions, stage)?;
+            return Ok(warped);
         }
         let placement = Placement { view: downsampled_view(placement, shrink, photo.size()), ..*placement };
         let field = field.map(|f| f.scaled(1.0, 1.0 / shrink as f64));
         let settings = WarpSettings { displacement: field.as_ref(), interpolation, correction, region };
-        warp(photo, &placement, &self.layout.surface, bounds, settings, stage)
+        let mut warped = warp(photo, &placement, &self.layout.surface, bounds, settings, stage)?;
+        self.masks.clear(k, &mut warped, self.regions, stage)?;
+        Ok(warped)
     }
 }
 

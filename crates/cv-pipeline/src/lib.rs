@@ -82,7 +82,7 @@ pub mod features {
 }
 pub use panorama::{
     LeftOut, NearestPair, PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto, PanoramaPrior,
-    PanoramaResult, panorama, panorama_streamed, panorama_with,
+    PanoramaResult, panorama, panorama_streamed, panorama_with, panorama_with_masks,
 };
 /// Types of the panorama's stages.
 pub mod panorama_types {

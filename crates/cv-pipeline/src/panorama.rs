@@ -1,9 +1,11 @@
 //! The panorama job: features, matching, alignment and compositing.
 
+mod masked;
 mod order;
 mod register;
 mod streamed;
 
+pub use masked::panorama_with_masks;
 pub use streamed::{PanoramaPrior, panorama_streamed};
 
 use crate::Progress;
@@ -12,7 +14,8 @@ use cv_core::{Camera, Cancelled, Correspondence, DMatch, Image, ImageView, Mask,
 use cv_features::{FeatureError, FeatureOptions, Features, SiftOptions};
 use cv_panorama::{
     AlignError, AlignOptions, Alignment, CameraMotion, Canvas, CompositingOptions, EightBits, PairRejection, Panorama,
-    PhotoMap, PhotoSample, Registration, RegistrationError, RenderError, Unplaced, VerifyOptions, render,
+    PhotoMap, PhotoMask, PhotoSample, Registration, RegistrationError, RenderError, Unplaced, VerifyOptions,
+    check_masks, render_masked,
 };
 use order::Order;
 use register::{Registered, register};
@@ -26,12 +29,14 @@ pub struct PanoramaPhoto<'a, T = u8> {
     pub focal: Option<f64>,
     /// The calibrated camera, where there is one; kept constant, and its distortion is corrected.
     pub camera: Option<Camera>,
+    /// Which parts must be in the panorama and which must not, where there is a mask; of the size of the photograph. Features of removed parts are not matched.
+    pub mask: Option<&'a PhotoMask>,
 }
 
 impl<'a, T> PanoramaPhoto<'a, T> {
     /// Creates a photograph of an unknown camera.
     pub fn new(image: ImageView<'a, T, 3>) -> Self {
-        Self { image, focal: None, camera: None }
+        Self { image, focal: None, camera: None, mask: None }
     }
 }
 
@@ -256,17 +261,20 @@ pub fn panorama<T: PhotoSample>(
     progress: &dyn Progress,
 ) -> Result<PanoramaResult<T>, PanoramaError> {
     let views: Vec<_> = photos.iter().map(|photo| photo.image).collect();
+    let masks: Vec<_> = photos.iter().map(|photo| photo.mask).collect();
+    check_masks(|index| views[index].size(), &masks)?;
     let order = Order::of(&views);
-    let (photos, views) = (order.sorted(photos), order.sorted(&views));
+    let (photos, views, masks) = (order.sorted(photos), order.sorted(&views), order.sorted(&masks));
     let stitch = || {
         let found = {
             let eight = EightBits::new(&views, "features", progress)?;
             let bytes = eight.views().into_iter().zip(&photos);
-            let bytes: Vec<_> =
-                bytes.map(|(image, p)| PanoramaPhoto { image, focal: p.focal, camera: p.camera }).collect();
+            let bytes: Vec<_> = bytes
+                .map(|(image, p)| PanoramaPhoto { image, focal: p.focal, camera: p.camera, mask: p.mask })
+                .collect();
             register(&bytes, options, progress)?
         };
-        composite(&views, found, &options.render, progress)
+        composite(&views, &masks, found, &options.render, progress)
     };
     stitch().map(|result| order.restored_result(result)).map_err(|error| order.restored_error(error))
 }
@@ -284,13 +292,7 @@ pub fn panorama_with<T: PhotoSample>(
     options: &CompositingOptions,
     progress: &dyn Progress,
 ) -> Result<PanoramaResult<T>, PanoramaError> {
-    let sizes: Vec<_> = photos.iter().map(ImageView::size).collect();
-    registration.check_photographs(&sizes)?;
-    let order = Order::of(photos);
-    let (photos, sizes) = (order.sorted(photos), order.sorted(&sizes));
-    let alignment = order.sorted_alignment(registration.alignment());
-    let found = known_registration(alignment, &sizes);
-    composite(&photos, found, options, progress).map(|result| order.restored_result(result))
+    panorama_with_masks(registration, photos, &[], options, progress)
 }
 
 /// Returns a registration as if by features.
@@ -314,11 +316,12 @@ fn known_registration(alignment: Alignment, sizes: &[(usize, usize)]) -> Registe
 /// Composites the panorama and collects the result.
 fn composite<T: PhotoSample>(
     photos: &[ImageView<'_, T, 3>],
+    masks: &[Option<&PhotoMask>],
     found: Registered,
     options: &CompositingOptions,
     progress: &dyn Progress,
 ) -> Result<PanoramaResult<T>, PanoramaError> {
-    collected(found, |alignment| render(photos, alignment, options, progress))
+    collected(found, |alignment| render_masked(photos, masks, alignment, options, progress))
 }
 
 /// Composites the panorama by `draw` and collects the result.

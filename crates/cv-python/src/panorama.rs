@@ -8,12 +8,12 @@ use crate::matching::feature_method;
 use crate::options::Options;
 use crate::photographs::{self, Ended};
 use crate::results::{self, object};
-use cv_core::{Camera, Image, ImageView, Progress, Sample};
+use cv_core::{Camera, Image, ImageView, Mask, Progress, Sample};
 use cv_io::{DynImage, ExifInfo, IoError, Metadata};
-use cv_pipeline::panorama_types::{Framing, PhotoSample, Registration};
+use cv_pipeline::panorama_types::{Framing, PhotoMask, PhotoSample, PhotoUse, Registration};
 use cv_pipeline::{
     FeatureOptions, PanoramaError, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama as join,
-    panorama_with as join_with,
+    panorama_with_masks as join_with,
 };
 use numpy::Element;
 use pyo3::exceptions::{PyTypeError, PyValueError};
@@ -29,6 +29,7 @@ pub(crate) struct Arguments {
     focal: Option<f64>,
     registration: Option<Registration>,
     run: Run,
+    masks: Vec<Option<PhotoMask>>,
 }
 
 impl Arguments {
@@ -49,14 +50,47 @@ impl Arguments {
         options.set_named("blend", &mut o.render.blend)?;
         options.set_named("seams", &mut o.render.seams)?;
         options.set("clean", &mut o.render.removes_transients)?;
+        let masks = masks(options)?;
         options.set_named("exposure", &mut o.render.exposure)?;
         options.set("crop", &mut o.render.crop)?;
         options.set("scale", &mut o.render.resolution)?;
         o.matching.features = PanoramaOptions::features(FeatureOptions::from(feature_method(options)?));
         options.set("seed", &mut o.verify.seed)?;
         let camera = camera.map(|camera| camera.get().camera);
-        Ok(Self { options: o, camera, focal, registration: registration.transpose()?, run: Run::read(options)? })
+        let (registration, run) = (registration.transpose()?, Run::read(options)?);
+        Ok(Self { options: o, camera, focal, registration, run, masks })
     }
+}
+
+/// Reads `keep` and `remove`: for each photograph a mask or `None`.
+fn masks(options: &mut Options<'_>) -> PyResult<Vec<Option<PhotoMask>>> {
+    let mut read = |name: &'static str| -> PyResult<Vec<Option<Mask>>> {
+        let Some(given) = options.take_any(name)? else { return Ok(Vec::new()) };
+        let one = |(i, mask): (usize, PyResult<Bound<'_, PyAny>>)| {
+            let mask = mask?;
+            (!mask.is_none()).then(|| arrays::mask(&mask, &format!("{name}[{i}]"))).transpose()
+        };
+        given.try_iter()?.enumerate().map(one).collect()
+    };
+    let (mut keep, mut remove) = (read("keep")?, read("remove")?);
+    let photographs = keep.len().max(remove.len());
+    keep.resize_with(photographs, || None);
+    remove.resize_with(photographs, || None);
+    let joined = |(i, (keep, remove)): (usize, (Option<Mask>, Option<Mask>))| {
+        let Some((width, height)) = keep.as_ref().or(remove.as_ref()).map(Image::size) else { return Ok(None) };
+        if let Some((w, h)) = remove.as_ref().map(Image::size).filter(|size| *size != (width, height)) {
+            return Err(PyValueError::new_err(format!(
+                "panorama(): keep[{i}] has {width} x {height} pixels, remove[{i}] has {w} x {h}"
+            )));
+        }
+        let is_in = |mask: &Option<Mask>, x: usize, y: usize| mask.as_ref().is_some_and(|mask| mask.at(x, y)[0]);
+        Ok(Some(PhotoMask::from_fn(width, height, |x, y| match (is_in(&remove, x, y), is_in(&keep, x, y)) {
+            (true, _) => PhotoUse::Remove,
+            (false, true) => PhotoUse::Keep,
+            (false, false) => PhotoUse::Free,
+        })))
+    };
+    keep.into_iter().zip(remove).enumerate().map(joined).collect()
 }
 
 /// Reads field of view, center and roll, in degrees.
@@ -224,16 +258,18 @@ impl Arguments {
     ) -> Result<PanoramaResult<T>, Ended<PanoramaError>> {
         let photos: Vec<PanoramaPhoto<'_, T>> = photographs
             .iter()
-            .map(|(pixels, exif)| PanoramaPhoto {
+            .enumerate()
+            .map(|(i, (pixels, exif))| PanoramaPhoto {
                 image: pixels.view(),
                 focal: self.focal.or(*exif),
                 camera: self.camera,
+                mask: self.masks.get(i).and_then(Option::as_ref),
             })
             .collect();
         let joined = match &self.registration {
             Some(registration) => {
-                let photos: Vec<_> = photos.iter().map(|photo| photo.image).collect();
-                join_with(registration, &photos, &self.options.render, progress)
+                let (photos, masks): (Vec<_>, Vec<_>) = photos.iter().map(|photo| (photo.image, photo.mask)).unzip();
+                join_with(registration, &photos, &masks, &self.options.render, progress)
             }
             None => join(&photos, &self.options, progress),
         };
@@ -246,6 +282,7 @@ impl Arguments {
 /// photographs: arrays of uint8 or uint16 (65535 is white), or paths; if one has 16 bits, so has the panorama. camera: the calibrated Camera of all photographs; focal: approximate focal length in px, by default from EXIF or self-calibrated.
 /// fov: horizontal field of view in degrees, or (horizontal, vertical); center: (yaw, pitch) in degrees, to the right of the center of the photographs and above the horizon; roll: degrees clockwise.
 /// registration: that of a `Panorama` of the same views (or the contents of a file of `cv panorama --save-registration`), used instead of matching; `camera`, `focal`, `mode` and `features` are then ignored.
+/// remove, keep: for each photograph a mask of its size (bool, or uint8 with 0 for false) or None, true where it must not be, or must be, in the panorama; `remove` is stronger.
 /// `defaults("panorama")` lists the options.
 #[pyfunction]
 #[pyo3(signature = (photographs, **options))]
@@ -258,6 +295,10 @@ pub(crate) fn panorama<'py>(
     let arguments = Arguments::read(&mut options)?;
     options.finish()?;
     let photographs = photographs::Photograph::each(photographs, Photograph::new)?;
+    if arguments.masks.len() > photographs.len() {
+        let (masks, photographs) = (arguments.masks.len(), photographs.len());
+        return Err(PyValueError::new_err(format!("panorama(): {masks} masks for {photographs} photographs")));
+    }
     let sources = photographs.iter().map(Photograph::source).collect::<PyResult<Vec<_>>>()?;
     let found = arguments.run.run(py, |progress| {
         let read: Vec<_> =

@@ -1,5 +1,6 @@
 //! `cv panorama`: stitches overlapping photographs.
 
+mod masks;
 mod registration;
 mod report;
 mod streamed;
@@ -9,11 +10,12 @@ use crate::{rig, words};
 use cv_core::{Camera, Image, ImageView};
 use cv_io::{DynImage, Metadata, Pixels, PngPixels};
 use cv_pipeline::panorama_types::{
-    BlendMode, CameraMotion, EightBits, Exposure, Framing, PhotoSample, Projection, Registration, Seams,
+    BlendMode, CameraMotion, EightBits, Exposure, Framing, PhotoMask, PhotoSample, Projection, Registration, Seams,
 };
 use cv_pipeline::{
-    FeatureMethod, FeatureOptions, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama, panorama_with,
+    FeatureMethod, FeatureOptions, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama, panorama_with_masks,
 };
+use masks::MaskFiles;
 use rayon::prelude::*;
 use serde_json::json;
 use std::collections::btree_map::{BTreeMap, Entry};
@@ -34,6 +36,7 @@ const EIGHT_BIT_ENDINGS: &[&str] = &["jpg", "jpeg", "dzi"];
     cv panorama raw16/*.tif -o pano.tif\n  \
     cv panorama raw16/*.tif -o pano.tif --layers layers/\n  \
     cv panorama square/ -o empty.png --clean\n  \
+    cv panorama square/ -o pano.png --remove IMG_3_mask.png --keep group/\n  \
     cv panorama gigapixel/ -o huge.tif --max-memory 4096\n  \
     cv panorama gigapixel/ -o web/huge.dzi --max-memory 4096\n  \
     cv panorama window/*.jpg -o light.exr\n  \
@@ -82,6 +85,14 @@ pub(crate) struct Args {
     /// Remove what moves: where three or more photographs show a place, prefer those near their median, so that people who walk through vanish.
     #[arg(long)]
     clean: bool,
+    /// Masks of what must not be in the panorama, such as a person, a car or a tripod: images of the size of their photograph, white there, or folders of them. The mask of IMG_1.jpg is named
+    /// IMG_1_mask.png or IMG_1.png. Another photograph is used there; where none reaches, the panorama is empty. Features there are not matched.
+    #[arg(long, value_name = "DIR|FILES", num_args = 1..)]
+    remove: Vec<PathBuf>,
+    /// Masks of what must be in the panorama, such as a person whom a seam cuts: their photograph is used there. Named as those of --remove, which is stronger where a photograph has both. Where two
+    /// photographs are kept, the one whose center is nearer is used.
+    #[arg(long, value_name = "DIR|FILES", num_args = 1..)]
+    keep: Vec<PathBuf>,
     /// Exposure compensation: none, or match: exposures and white balances, with the camera response and vignetting, estimated jointly in linear intensity.
     #[arg(long, value_name = "WHAT", value_parser = named::<Exposure>(), default_value_t = PanoramaOptions::default().render.exposure)]
     exposure: Exposure,
@@ -204,13 +215,16 @@ impl Run for Args {
                 .advice("--blend multiband, and an output as .tif"));
         }
         let registration = self.registration.as_deref().map(|path| registration::read(path, context)).transpose()?;
-        let paths = expand_images(&self.images)?;
+        let mut paths = expand_images(&self.images)?;
+        let masks = MaskFiles::find(&self.keep, &self.remove, &mut paths)?;
         let results: Vec<PathBuf> = [&self.output].into_iter().chain(&self.save_registration).cloned().collect();
-        let inputs: Vec<&Path> = paths.iter().chain(&self.registration).map(PathBuf::as_path).collect();
+        let inputs: Vec<&Path> =
+            paths.iter().chain(&self.registration).chain(masks.paths()).map(PathBuf::as_path).collect();
         spare_inputs(&results, &inputs)?;
+        let masks = masks.read(&paths, context)?;
         // Streamed panoramas have the same pixels, and layers at hand.
         if let Some(bytes) = context.max_memory.or_else(|| self.layers.as_ref().map(|_| usize::MAX / 4)) {
-            return self.stitch_streamed(&paths, registration.as_ref(), bytes, context);
+            return self.stitch_streamed(&paths, &masks, registration.as_ref(), bytes, context);
         }
         let pictures = paths.par_iter().map(cv_io::read_image).collect::<Result<Vec<_>, _>>()?;
         let known: Vec<_> =
@@ -218,10 +232,10 @@ impl Run for Args {
         let is_deep = |picture: &DynImage| matches!(picture.pixels, Pixels::Gray16(_) | Pixels::Rgb16(_));
         if !self.ends_in(EIGHT_BIT_ENDINGS) && pictures.iter().any(is_deep) {
             let images: Vec<_> = pictures.into_par_iter().map(DynImage::into_rgb16).collect();
-            self.stitch(&paths, &images, &known, registration.as_ref(), context)
+            self.stitch(&paths, &images, &known, &masks, registration.as_ref(), context)
         } else {
             let images: Vec<_> = pictures.into_par_iter().map(DynImage::into_rgb8).collect();
-            self.stitch(&paths, &images, &known, registration.as_ref(), context)
+            self.stitch(&paths, &images, &known, &masks, registration.as_ref(), context)
         }
     }
 }
@@ -255,6 +269,7 @@ impl Args {
         paths: &[PathBuf],
         images: &[Image<T, 3>],
         known: &[(Option<f64>, Metadata)],
+        masks: &[Option<PhotoMask>],
         registration: Option<&Registration>,
         context: &Context,
     ) -> Result<Outcome, Failure>
@@ -267,17 +282,19 @@ impl Args {
         let photos: Vec<PanoramaPhoto<'_, T>> = images
             .iter()
             .zip(known)
-            .map(|(image, (focal, _))| PanoramaPhoto {
+            .zip(masks)
+            .map(|((image, (focal, _)), mask)| PanoramaPhoto {
                 image: image.view(),
                 focal: *focal,
                 camera: cameras.get(&image.size()).copied(),
+                mask: mask.as_ref(),
             })
             .collect();
         let options = self.options(context);
         let result = match registration {
             Some(registration) => {
-                let photos: Vec<_> = photos.iter().map(|photo| photo.image).collect();
-                panorama_with(registration, &photos, &options.render, context)
+                let (photos, masks): (Vec<_>, Vec<_>) = photos.iter().map(|photo| (photo.image, photo.mask)).unzip();
+                panorama_with_masks(registration, &photos, &masks, &options.render, context)
             }
             None => panorama(&photos, &options, context),
         };

@@ -6,6 +6,7 @@ use crate::frame::{
     Context, Explain, Failure, Global, JSON, Outcome, Output, Run, Step, expand_images, named, one_each, same_file,
     steps,
 };
+use crate::masks::{stem, without_masks};
 use crate::pictures::{Width, picture};
 use cv_core::{Mask, Named, RgbU8, Stage};
 use cv_pipeline::segmentation::{
@@ -14,7 +15,7 @@ use cv_pipeline::segmentation::{
 };
 use cv_pipeline::{detect, segment, train_segment};
 use cv_report::{Figure, Note, Report, colors, overlay_comparison, overlay_mask};
-use files::{Pair, pair, read_pair, stem};
+use files::{Pair, pair, read_pair};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -223,7 +224,7 @@ impl Predict {
         let options = DetectOptions { min_score: self.min_score };
         options.validate().map_err(Failure::usage)?;
         let given = expand_images(&self.images)?;
-        let photos = files::without_masks(given.clone());
+        let photos = without_masks(given.clone());
         let outputs: Vec<PathBuf> = photos.iter().map(|p| self.output.join(format!("{}_mask.png", stem(p)))).collect();
         one_each(&photos, &outputs)?;
         let model = read_model(&self.model)?;

@@ -15,6 +15,7 @@ pub(crate) use scratch::WarpedStore;
 use crate::align::Alignment;
 use crate::bit_depth::PhotoSample;
 use crate::blend::NO_PHOTO;
+use crate::masks::{Filled, PhotoMask, PlacedMasks};
 use crate::photometric::{Exposure, Gains, estimate_gains};
 use crate::regions::regions;
 use crate::render::{CompositingOptions, Drawing, PREVIEW_PIXELS, Panorama, RenderError, check, draw};
@@ -40,6 +41,12 @@ where
 
     /// Loads a photograph, of that size; `None` where it can no longer be read. Called several times, from several threads.
     fn load(&self, index: usize) -> Option<Cow<'_, Image<T, 3>>>;
+
+    /// Returns the mask of a photograph. Default none.
+    fn mask(&self, index: usize) -> Option<&PhotoMask> {
+        let _ = index;
+        None
+    }
 }
 
 /// The rows of a panorama could not be written; the [`RowSink`] knows why.
@@ -199,7 +206,8 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     progress: &dyn Progress,
 ) -> Result<Panorama<T>, RenderError> {
     let mut clock = StageClock::new();
-    check(|index| photos.size(index), alignment, options)?;
+    let masks: Vec<Option<&PhotoMask>> = (0..alignment.views.len()).map(|index| photos.mask(index)).collect();
+    check(|index| photos.size(index), &masks, alignment, options)?;
     let layout = layout(alignment, options.projection, &options.framing, options.resolution, options.max_pixels)?;
     let photo_of: Vec<usize> = layout.placements.iter().map(|p| p.photo).collect();
     let typical_side = layout.typical_side();
@@ -209,8 +217,9 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     let fewest_rows = blend::fewest_rows(options.blend, levels);
     let budget = Budget::new::<T>(&layout, &largest, options, fewest_rows, limit.bytes)?;
     if needs_whole(options).is_some() {
-        return draw_whole(photos, alignment, options, output, progress);
+        return draw_whole(photos, &masks, alignment, options, output, progress);
     }
+    let photos: &dyn PhotoSource<T> = &Filled(photos);
     let scratch = Scratch::new(limit.scratch);
 
     let scale = PreviewScale::new(&layout, options.resolution, PREVIEW_PIXELS);
@@ -220,7 +229,13 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
         let fields = if options.elastic {
             let each = grays.iter().flatten().map(|((w, h), _)| w * h).max().unwrap_or(1).max(1);
             let store = GrayStore::new(&scratch, grays, budget.work / 2 / each);
-            displacements_with(&|index| store.get(index).map_err(RenderError::from), &layout, alignment, &stage)?
+            displacements_with(
+                &|index| store.get(index).map_err(RenderError::from),
+                &masks,
+                &layout,
+                alignment,
+                &stage,
+            )?
         } else {
             vec![None; layout.placements.len()]
         };
@@ -233,11 +248,16 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
         Preview::draw_small(&small, &layout, &fields, scale, &stage)?
     };
     drop(small);
+    let placed = PlacedMasks::new(&masks, &layout, &fields);
+    let masked = placed.on_preview(&preview, scale, progress)?;
+    masked.remove(&mut preview);
     clock.lap("preview");
     let gains = estimate_gains(&preview, &photo_of, alignment.views.len(), options.exposure, progress)?;
     if options.exposure != Exposure::None {
         preview.correct(&gains, &photo_of);
     }
+    masked.keep(&mut preview);
+    drop(masked);
     clock.lap("exposure");
     let coarse =
         seams::on_preview(&preview, &photo_of, options.seams, options.radiance, options.removes_transients, progress)?;
@@ -246,7 +266,7 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     drop(preview);
     clock.lap("seams");
 
-    let drawing = Drawing { layout: &layout, regions: &regions, fields: &fields, options };
+    let drawing = Drawing { layout: &layout, regions: &regions, fields: &fields, options, masks: &placed };
     let warped = warped(photos, &drawing, &gains, &scratch, progress)?;
     clock.lap("warp");
     let mut labels = LabelRows::new(canvas.0);
@@ -347,6 +367,7 @@ fn frame(size: (usize, usize), alignment: &Alignment) -> StreamedFrame {
 /// Composites in memory what cannot be blended in strips, where it fits.
 fn draw_whole<T: PhotoSample>(
     photos: &dyn PhotoSource<T>,
+    masks: &[Option<&PhotoMask>],
     alignment: &Alignment,
     options: &CompositingOptions,
     output: &mut dyn RowSink<T>,
@@ -360,7 +381,7 @@ fn draw_whole<T: PhotoSample>(
     let images: Vec<Cow<'_, Image<T, 3>>> =
         alignment.views.iter().enumerate().map(load).collect::<Result<_, StreamError>>()?;
     let views: Vec<ImageView<'_, T, 3>> = images.iter().map(|image| image.view()).collect();
-    let mut panorama = draw(&views, alignment, options, options.blend.blender(), progress)?;
+    let mut panorama = draw(&views, masks, alignment, options, options.blend.blender(), progress)?;
     output.begin(&frame(panorama.size, alignment))?;
     output.rows(panorama.image.view(), panorama.labels.view())?;
     panorama.image = no_image().into_owned();

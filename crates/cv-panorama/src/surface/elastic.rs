@@ -5,6 +5,7 @@
 //! damping term (zero displacement without data); it is minimized by iteratively reweighted least squares.
 
 use crate::align::Alignment;
+use crate::masks::{PhotoMask, is_removed, is_removed_near};
 use crate::surface::structure_tensor::StructureTensor;
 use crate::surface::{DisplacementField, Layout, PAD, Placement, SEARCH_RADIUS, SEARCH_SIDE, Surface, Template};
 use cv_core::{Cancelled, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
@@ -43,6 +44,7 @@ const MAX_DISPLACEMENT_RATIO: f64 = 0.04;
 /// Estimates the displacement field of every placement.
 pub(crate) fn displacements(
     photos: &[ImageView<'_, u8, 3>],
+    masks: &[Option<&PhotoMask>],
     layout: &Layout,
     alignment: &Alignment,
     progress: &dyn Progress,
@@ -53,7 +55,7 @@ pub(crate) fn displacements(
         stage.add(1).map(|()| gray)
     };
     let grays: Vec<GrayU8> = photos.par_iter().map(gray).collect::<Result<_, _>>()?;
-    displacements_with(&|photo| Ok::<_, Cancelled>(&grays[photo]), layout, alignment, &stage)
+    displacements_with(&|photo| Ok::<_, Cancelled>(&grays[photo]), masks, layout, alignment, &stage)
 }
 
 /// Units of progress of [`displacements_with`]: one for every solution and every round of patch registration.
@@ -65,6 +67,7 @@ pub(crate) const ROUND_UNITS: usize = 5;
 /// [`Cancelled`], and errors of `gray`.
 pub(crate) fn displacements_with<G, E>(
     gray: &(impl Fn(usize) -> Result<G, E> + Sync),
+    masks: &[Option<&PhotoMask>],
     layout: &Layout,
     alignment: &Alignment,
     stage: &Stage<'_>,
@@ -77,10 +80,12 @@ where
     let spacing = (side / CELLS).max(8.0);
     let mut fields: Vec<_> = layout.placements.iter().map(|p| DisplacementField::over(&p.bounds, spacing)).collect();
     let mut ties = feature_ties(layout, alignment, MAX_DISPLACEMENT_RATIO * side, stage)?;
+    ties.retain(|t| !is_removed(masks, layout, t.p, t.a) && !is_removed(masks, layout, t.q, t.b));
     // Feature positions have errors of up to a pixel, registered patches of a fraction.
     solve(&mut fields, &ties, 3.0, stage)?;
     stage.add(1)?;
     let mut sites = patch_sites(layout, spacing);
+    sites.retain(|site| ![site.p, site.q].iter().any(|&k| is_removed_near(masks, layout, k, site.at, WINDOW_RADIUS)));
     let features = ties.len();
     // The first round brings more patches within the search range of the second.
     for _ in 0..2 {
@@ -262,6 +267,8 @@ fn conjugate_gradients(
 
 /// Patch radius in canvas pixels.
 const PATCH_RADIUS: usize = 8;
+/// Radius in canvas pixels of what is compared with a patch.
+const WINDOW_RADIUS: usize = PATCH_RADIUS + SEARCH_RADIUS;
 /// Maximum number of patches per overlap.
 const MAX_PATCHES: usize = 800;
 
@@ -361,7 +368,7 @@ fn register_overlap(
             let k = [p, q][side];
             patch(photos[side], layout, &fields[k], k, c, axis, (along, across))
         };
-        let (wide, right) = (PATCH_RADIUS + SEARCH_RADIUS, Vector2::x());
+        let (wide, right) = (WINDOW_RADIUS, Vector2::x());
         let Some(first) = sample(0, right, PATCH_RADIUS, PATCH_RADIUS) else { return Ok(()) };
         let tensor = StructureTensor::of(&first);
         site.is_low_texture = tensor.strengths[1] < MIN_CORNER_STRENGTH && !tensor.is_edge();
@@ -572,7 +579,7 @@ mod tests {
         let alignment = alignment(&views);
         let layout = layout(&alignment, Projection::Cylindrical, &Framing::default(), 1.0, 1_000_000).unwrap();
         let photos = [first.view(), second.view()];
-        let fields = displacements(&photos, &layout, &alignment, &Silent).unwrap();
+        let fields = displacements(&photos, &[], &layout, &alignment, &Silent).unwrap();
         let size = (layout.width, layout.height);
         let before = misfit(&PhotoMap::new(&layout, vec![None, None]), &views, size);
         let after = misfit(&PhotoMap::new(&layout, fields), &views, size);
@@ -580,10 +587,10 @@ mod tests {
         assert!(before > 1.8 && after < 0.45, "{before} {after}");
         // Stopped at any report, in any of its parts, it is stopped.
         let watched = StopAt::never();
-        displacements(&photos, &layout, &alignment, &watched).unwrap();
+        displacements(&photos, &[], &layout, &alignment, &watched).unwrap();
         for at in (1..=watched.reports()).step_by(watched.reports().div_ceil(12)) {
             let stop = StopAt::report(at);
-            assert!(displacements(&photos, &layout, &alignment, &stop).is_err(), "{at}");
+            assert!(displacements(&photos, &[], &layout, &alignment, &stop).is_err(), "{at}");
         }
     }
 
@@ -593,7 +600,7 @@ mod tests {
         let photos = [photograph(&views[0], sky), photograph(&views[1], sky)];
         let alignment = alignment(&views);
         let layout = layout(&alignment, Projection::Cylindrical, &Framing::default(), 1.0, 1_000_000).unwrap();
-        let fields = displacements(&[photos[0].view(), photos[1].view()], &layout, &alignment, &Silent).unwrap();
+        let fields = displacements(&[photos[0].view(), photos[1].view()], &[], &layout, &alignment, &Silent).unwrap();
         for field in fields.iter().flatten() {
             // The accuracy of patch registration with gray levels rounded to integers.
             assert!(field.displacement.iter().all(|d| d.norm() < 0.1), "{:?}", field.displacement);

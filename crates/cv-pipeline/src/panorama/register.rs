@@ -2,13 +2,15 @@
 
 use crate::Progress;
 use crate::matching::{MatchingOptions, correspondences, match_features, rescale};
+use crate::panorama::masked::{clip_removed, drop_removed};
 use crate::panorama::{
     LeftOut, NearestPair, PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto,
 };
-use cv_core::{Camera, Cancelled, GrayF32, GrayU8, Scaling, Stage, StageClock, UnionFind};
+use cv_core::{Camera, Cancelled, GrayF32, GrayU8, RgbU8, Scaling, Stage, StageClock, UnionFind};
 use cv_features::{FeatureError, FeatureOptions, Features, MatchError, SiftOptions};
 use cv_panorama::{
-    AlignError, Alignment, PairRejection, Photo, Unplaced, VerifiedPair, align, refine_alignment, verify_pair,
+    AlignError, Alignment, PairRejection, Photo, PhotoMask, Unplaced, VerifiedPair, align, refine_alignment,
+    verify_pair,
 };
 use rayon::prelude::*;
 
@@ -34,10 +36,7 @@ pub(super) fn register(
     let mut prepared: Vec<Prepared> = Vec::with_capacity(n);
     {
         let stage = Stage::new(progress, "features", n)?;
-        let resize = |p: &PanoramaPhoto<'_>| {
-            stage.check()?;
-            Ok(Prepared::new(p, &options.matching, options.registration_pixels))
-        };
+        let resize = |p: &PanoramaPhoto<'_>| Prepared::new(p, &options.matching, options.registration_pixels, &stage);
         for batch in indices.chunks(photos.at_once()) {
             let batch = batch.par_iter().map(|index| photos.prepare(*index, &resize));
             prepared.extend(batch.collect::<Result<Vec<_>, _>>()?);
@@ -144,24 +143,35 @@ pub(super) struct Prepared {
     features: Features,
     /// Why feature extraction failed.
     failure: Option<FeatureError>,
+    /// Mask of the photograph.
+    mask: Option<PhotoMask>,
 }
 
 impl Prepared {
     /// Resizes a photograph for registration; without features yet.
-    fn new(p: &PanoramaPhoto<'_>, matching: &MatchingOptions, registration_pixels: usize) -> Self {
-        let (w, h) = p.image.size();
+    fn new(
+        p: &PanoramaPhoto<'_>,
+        matching: &MatchingOptions,
+        registration_pixels: usize,
+        stage: &Stage<'_>,
+    ) -> Result<Self, Cancelled> {
+        stage.check()?;
+        let filled = p.mask.map(|mask| mask.filled(p.image, stage)).transpose()?.flatten();
+        let whole = filled.as_ref().map_or(p.image, RgbU8::view);
+        let (w, h) = whole.size();
         let factor = ((w * h) as f64 / registration_pixels.max(10_000) as f64).sqrt().max(1.0);
         let size = ((w as f64 / factor).round() as usize, (h as f64 / factor).round() as usize);
-        let reduced = (factor > 1.2).then(|| cv_imgproc::resize_area(p.image, size.0, size.1).ok()).flatten();
+        let reduced = (factor > 1.2).then(|| cv_imgproc::resize_area(whole, size.0, size.1).ok()).flatten();
         let (image, factor) = match &reduced {
             Some(small) => (small.view(), w as f64 / size.0 as f64),
-            None => (p.image, 1.0),
+            None => (whole, 1.0),
         };
         let (width, height) = image.size();
         let camera = p.camera.map(|c| Camera { width, height, ..c.scaled(1.0 / factor) });
         let photo = Photo { width, height, focal: p.focal.map(|f| f / factor), camera };
         let features = Features::new(matching.features.extractor().kind());
-        Self { photo, factor, gray: cv_imgproc::rgb_to_gray_f32(image), features, failure: None }
+        let (gray, mask) = (cv_imgproc::rgb_to_gray_f32(image), p.mask.cloned());
+        Ok(Self { photo, factor, gray, features, failure: None, mask })
     }
 
     /// Extracts the features.
@@ -172,13 +182,20 @@ impl Prepared {
             Err(FeatureError::Cancelled(stop)) => return Err(stop),
             Err(error) => (Features::new(extractor.kind()), Some(error)),
         };
+        if let Some(mask) = &self.mask {
+            drop_removed(&mut self.features, mask, self.factor);
+        }
         Ok(())
     }
 
-    /// Rounds the luma to gray levels, and frees it.
+    /// Rounds the luma to gray levels, with the removed pixels clipped, and frees it.
     fn take_gray(&mut self) -> GrayU8 {
         let gray = std::mem::replace(&mut self.gray, GrayF32::new(0, 0, [0.0]));
-        cv_imgproc::f32_to_u8(gray.view())
+        let mut gray = cv_imgproc::f32_to_u8(gray.view());
+        if let Some(mask) = &self.mask {
+            clip_removed(&mut gray, mask, self.factor);
+        }
+        gray
     }
 
     /// Returns the features in pixels of the photograph.

@@ -6,8 +6,8 @@ use super::{PanoramaError, PanoramaOptions, PanoramaPhoto, PanoramaResult, colle
 use crate::Progress;
 use cv_core::{Camera, Image, ImageView, Stage};
 use cv_panorama::{
-    EightBits, Layer, MemoryLimit, NO_PHOTO, NotWritten, PhotoSample, PhotoSource, Registration, RenderError, RowSink,
-    StreamError, StreamedFrame, render_streamed,
+    EightBits, Layer, MemoryLimit, NO_PHOTO, NotWritten, PhotoMask, PhotoSample, PhotoSource, Registration,
+    RenderError, RowSink, StreamError, StreamedFrame, check_masks, render_streamed,
 };
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -41,6 +41,8 @@ pub fn panorama_streamed<T: PhotoSample>(
     if let Some(registration) = registration {
         registration.check_photographs(&sizes)?;
     }
+    let masks: Vec<_> = (0..priors.len()).map(|index| photos.mask(index)).collect();
+    check_masks(|index| sizes[index], &masks)?;
     let largest = sizes.iter().map(|(w, h)| w * h).max().unwrap_or(0);
     // The file, the decoder's output, a copy of 8 bits, and the features of the resized photograph, for which 100 bytes per pixel are ample.
     let each = largest * (4 * size_of::<T>() + 1) + 100 * options.registration_pixels;
@@ -101,6 +103,10 @@ impl<T: PhotoSample> PhotoSource<T> for Sorted<'_, T> {
     fn load(&self, index: usize) -> Option<Cow<'_, Image<T, 3>>> {
         self.photos.load(*self.inputs.get(index)?)
     }
+
+    fn mask(&self, index: usize) -> Option<&PhotoMask> {
+        self.photos.mask(*self.inputs.get(index)?)
+    }
 }
 
 /// Photographs for registration.
@@ -132,7 +138,7 @@ impl<T: PhotoSample> Photographs for Loaded<'_, T> {
         let [image] = bytes.views()[..] else {
             return Err(RenderError::from(StreamError::Photograph { index }).into());
         };
-        Ok(prepare(&PanoramaPhoto { image, focal, camera })?)
+        Ok(prepare(&PanoramaPhoto { image, focal, camera, mask: self.photos.mask(index) })?)
     }
 }
 

@@ -5,6 +5,7 @@ mod dense;
 mod filled;
 mod flat_map;
 mod generated;
+mod masks;
 mod panorama;
 mod reconstruct;
 mod refusals;

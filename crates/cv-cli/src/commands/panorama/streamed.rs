@@ -6,8 +6,8 @@ use crate::words;
 use cv_core::{Image, ImageView, RgbU8};
 use cv_io::{DynImage, ImageHeader, IoError, Metadata, PngPixels, RowWriter};
 use cv_pipeline::panorama_types::{
-    EightBits, Layer, MemoryLimit, NO_PHOTO, NotWritten, PhotoSample, PhotoSource, Registration, RenderError, RowSink,
-    StreamError, StreamedFrame,
+    EightBits, Layer, MemoryLimit, NO_PHOTO, NotWritten, PhotoMask, PhotoSample, PhotoSource, Registration,
+    RenderError, RowSink, StreamError, StreamedFrame,
 };
 use cv_pipeline::{PanoramaError, PanoramaPrior, PanoramaResult, panorama_streamed};
 use cv_report::shrink_to_fit;
@@ -25,6 +25,7 @@ const LAYER_ROWS: usize = 256;
 struct Files<'a, T> {
     paths: &'a [PathBuf],
     headers: &'a [ImageHeader],
+    masks: &'a [Option<PhotoMask>],
     convert: fn(DynImage) -> Image<T, 3>,
     /// The first error.
     failure: Mutex<Option<IoError>>,
@@ -43,6 +44,10 @@ impl<T: PhotoSample> PhotoSource<T> for Files<'_, T> {
                 None
             }
         }
+    }
+
+    fn mask(&self, index: usize) -> Option<&PhotoMask> {
+        self.masks.get(index)?.as_ref()
     }
 }
 
@@ -175,16 +180,19 @@ impl Args {
     pub(super) fn stitch_streamed(
         &self,
         paths: &[PathBuf],
+        masks: &[Option<PhotoMask>],
         registration: Option<&Registration>,
         max_memory: usize,
         context: &Context,
     ) -> Result<Outcome, Failure> {
         let headers = paths.iter().map(cv_io::read_image_header).collect::<Result<Vec<_>, _>>()?;
         if !self.ends_in(EIGHT_BIT_ENDINGS) && headers.iter().any(|header| header.depth == 2) {
-            let files = Files { paths, headers: &headers, convert: DynImage::into_rgb16, failure: Mutex::default() };
+            let files =
+                Files { paths, headers: &headers, masks, convert: DynImage::into_rgb16, failure: Mutex::default() };
             self.stitch_files(&files, registration, max_memory, context)
         } else {
-            let files = Files { paths, headers: &headers, convert: DynImage::into_rgb8, failure: Mutex::default() };
+            let files =
+                Files { paths, headers: &headers, masks, convert: DynImage::into_rgb8, failure: Mutex::default() };
             self.stitch_files(&files, registration, max_memory, context)
         }
     }
