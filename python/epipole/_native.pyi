@@ -408,7 +408,7 @@ def panorama(
     blend: Literal["multiband", "poisson", "feather", "none"] | None = "multiband",
     seams: Literal["graphcut", "voronoi"] | None = "graphcut",
     clean: bool | None = False,
-    exposure: Literal["none", "match"] | None = "match",
+    exposure: Literal["none", "match", "adapt"] | None = "match",
     crop: bool | None = False,
     scale: float | None = 1.0,
     features: Literal["sift", "mops", "harris"] | None = "sift",

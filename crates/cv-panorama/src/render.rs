@@ -4,7 +4,8 @@ use crate::align::Alignment;
 use crate::bit_depth::{Channel, EightBits, PhotoSample};
 use crate::blend::{BlendMode, Blender, Composition, NO_PHOTO, of_mode};
 use crate::photometric::{
-    Exposure, ExposureCorrection, Gains, Tone, decode_radiance, estimate_gains, fill_saturated, relative_gains,
+    Adaptation, Exposure, ExposureCorrection, Gains, Tone, decode_radiance, estimate_gains, fill_saturated,
+    relative_gains,
 };
 use crate::regions::{Region, regions};
 use crate::rows::for_each_row;
@@ -197,8 +198,9 @@ pub(crate) fn draw<T: PhotoSample>(
     drop(eight);
     clock.lap("preview");
     let gains = estimate_gains(&preview, &photo_of, photos.len(), options.exposure, progress)?;
+    let adaptation = Adaptation::new(&preview, &gains, &photo_of, options.exposure, &layout, progress)?;
     if options.exposure != Exposure::None {
-        preview.correct(&gains, &photo_of);
+        preview.correct(&gains, adaptation.as_ref(), &photo_of);
     }
     clock.lap("exposure");
     let coarse =
@@ -209,7 +211,8 @@ pub(crate) fn draw<T: PhotoSample>(
     // No canvas has more levels.
     let levels = blender.pyramid_levels(typical_side).min(16);
     let regions = regions(&coarse, &preview, &layout, levels);
-    let drawing = Drawing { layout: &layout, regions: &regions, fields: &fields, options };
+    let drawing =
+        Drawing { layout: &layout, regions: &regions, fields: &fields, options, adaptation: adaptation.as_ref() };
     let warped = drawing.warped(photos, &gains, progress)?;
     clock.lap("warp");
     let mut labels = {
@@ -296,6 +299,7 @@ pub(crate) struct Drawing<'a> {
     pub(crate) regions: &'a [Option<Region>],
     pub(crate) fields: &'a [Option<DisplacementField>],
     pub(crate) options: &'a CompositingOptions,
+    pub(crate) adaptation: Option<&'a Adaptation>,
 }
 
 impl Drawing<'_> {
@@ -312,7 +316,7 @@ impl Drawing<'_> {
         progress: &dyn Progress,
     ) -> Result<Vec<Option<WarpedPhoto<T>>>, Cancelled> {
         let stage = Stage::new(progress, "warp", self.layout.placements.len())?;
-        let tone = gains.tone(T::PARTS);
+        let tone = gains.adapted_tone(self.adaptation, T::PARTS);
         let draw = |k: usize, region: &Region| {
             self.warped_one(photos[self.layout.placements[k].photo], k, region, gains, &tone, &stage)
         };
@@ -330,7 +334,9 @@ impl Drawing<'_> {
         stage: &Stage<'_>,
     ) -> Result<WarpedPhoto<T>, Cancelled> {
         let is_corrected = self.options.exposure != Exposure::None;
-        let correction = is_corrected.then(|| ExposureCorrection::new(tone, gains, self.layout.placements[k].photo));
+        let photo_index = self.layout.placements[k].photo;
+        let correction =
+            is_corrected.then(|| ExposureCorrection::new(tone, gains, photo_index).adapted(self.adaptation));
         let shrink = self.shrink();
         if shrink == 1 {
             return self.warp(photo, k, region.bounds, Some(region), correction, stage);
@@ -812,6 +818,14 @@ mod tests {
             let (one, three) = (with(1), with(3));
             assert!(one.image == three.image && one.labels == three.labels, "{blend:?}");
         }
+        let fading: Vec<RgbU8> = (0..3).map(|i| set.photos[i].map(|c| c.map(|v| v >> i))).collect();
+        let fading: Vec<_> = fading.iter().map(RgbU8::view).collect();
+        let options = CompositingOptions { exposure: Exposure::Adapt, ..CompositingOptions::default() };
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| render(&fading, &set.alignment, &options, &Silent).unwrap().image)
+        };
+        assert!(with(1) == with(3));
         let deep: Vec<Image<u16, 3>> = set.photos.iter().map(|p| p.map(|c| c.map(|v| 250 * u16::from(v)))).collect();
         let views: Vec<_> = deep.iter().map(Image::view).collect();
         let options = CompositingOptions { radiance: true, ..CompositingOptions::default() };

@@ -37,6 +37,7 @@ const EIGHT_BIT_ENDINGS: &[&str] = &["jpg", "jpeg", "dzi"];
     cv panorama gigapixel/ -o huge.tif --max-memory 4096\n  \
     cv panorama gigapixel/ -o web/huge.dzi --max-memory 4096\n  \
     cv panorama window/*.jpg -o light.exr\n  \
+    cv panorama sunset/*.jpg -o pano.png --exposure adapt\n  \
     cv panorama wide/ -o pano.png --camera cam.yaml\n  \
     cv panorama wall/ -o plan.tif --mode plane\n  \
     cv panorama street/ -o wide.png --projection panini --fov 150,80\n  \
@@ -82,7 +83,8 @@ pub(crate) struct Args {
     /// Remove what moves: where three or more photographs show a place, prefer those near their median, so that people who walk through vanish.
     #[arg(long)]
     clean: bool,
-    /// Exposure compensation: none, or match: exposures and white balances, with the camera response and vignetting, estimated jointly in linear intensity.
+    /// Exposure compensation: none; match: exposures and white balances, with the camera response and vignetting, estimated jointly in linear intensity; or adapt: as match, then every place in the
+    /// exposure of the photographs that show it, by a smooth local gain, for exposures that span more than about 1.5 stops.
     #[arg(long, value_name = "WHAT", value_parser = named::<Exposure>(), default_value_t = PanoramaOptions::default().render.exposure)]
     exposure: Exposure,
     /// Crop the result to the largest rectangle without empty pixels.
@@ -198,6 +200,10 @@ impl Run for Args {
         if self.clean && self.seams == Seams::Voronoi {
             return Err(Failure::usage("--clean has no effect with --seams voronoi, which ignores the content")
                 .advice("--seams graphcut"));
+        }
+        if self.exposure == Exposure::Adapt && self.ends_in(&["exr"]) {
+            return Err(Failure::usage("--exposure adapt has no effect on .exr outputs: radiance is not toned")
+                .advice("--exposure match, or an output as .tif"));
         }
         if self.layers.is_some() && (self.blend == BlendMode::Poisson || self.ends_in(&["exr"])) {
             return Err(Failure::usage("--layers cannot be combined with --blend poisson and .exr outputs")

@@ -15,7 +15,7 @@ pub(crate) use scratch::WarpedStore;
 use crate::align::Alignment;
 use crate::bit_depth::PhotoSample;
 use crate::blend::NO_PHOTO;
-use crate::photometric::{Exposure, Gains, estimate_gains};
+use crate::photometric::{Adaptation, Exposure, Gains, estimate_gains};
 use crate::regions::regions;
 use crate::render::{CompositingOptions, Drawing, PREVIEW_PIXELS, Panorama, RenderError, check, draw};
 use crate::seams::{self, Seams};
@@ -235,8 +235,9 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     drop(small);
     clock.lap("preview");
     let gains = estimate_gains(&preview, &photo_of, alignment.views.len(), options.exposure, progress)?;
+    let adaptation = Adaptation::new(&preview, &gains, &photo_of, options.exposure, &layout, progress)?;
     if options.exposure != Exposure::None {
-        preview.correct(&gains, &photo_of);
+        preview.correct(&gains, adaptation.as_ref(), &photo_of);
     }
     clock.lap("exposure");
     let coarse =
@@ -246,7 +247,8 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     drop(preview);
     clock.lap("seams");
 
-    let drawing = Drawing { layout: &layout, regions: &regions, fields: &fields, options };
+    let drawing =
+        Drawing { layout: &layout, regions: &regions, fields: &fields, options, adaptation: adaptation.as_ref() };
     let warped = warped(photos, &drawing, &gains, &scratch, progress)?;
     clock.lap("warp");
     let mut labels = LabelRows::new(canvas.0);
@@ -430,7 +432,7 @@ fn warped<'s, T: PhotoSample>(
 ) -> Result<WarpedStore<'s, T>, RenderError> {
     let placements = &drawing.layout.placements;
     let stage = Stage::new(progress, "warp", placements.len())?;
-    let tone = gains.tone(T::PARTS);
+    let tone = gains.adapted_tone(drawing.adaptation, T::PARTS);
     let mut store = WarpedStore::new(scratch);
     let load = |k: usize| -> Result<Option<Cow<'_, Image<T, 3>>>, StreamError> {
         let needed = placements.get(k).filter(|_| drawing.regions[k].is_some());

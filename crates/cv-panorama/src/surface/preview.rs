@@ -1,10 +1,10 @@
 //! The canvas at reduced resolution, on which exposure compensation and seam finding run.
 
 use crate::align::View;
-use crate::photometric::{ExposureCorrection, Gains, SATURATED_LEVEL};
+use crate::photometric::{Adaptation, ExposureCorrection, Gains, SATURATED_LEVEL};
 use crate::rows::is_check_due;
 use crate::surface::{Bounds, DisplacementField, Layout, Map, Placement, Surface, WarpSettings, WarpedPhoto, warp};
-use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Scaling, Stage};
+use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Scaling, Stage, luma_f32};
 use cv_imgproc::Interpolation;
 use rayon::prelude::*;
 
@@ -148,13 +148,19 @@ impl Preview {
     }
 
     /// Applies the exposure correction to every piece.
-    pub(crate) fn correct(&mut self, gains: &Gains, photo_of: &[usize]) {
-        let tone = gains.tone(1);
+    pub(crate) fn correct(&mut self, gains: &Gains, adaptation: Option<&Adaptation>, photo_of: &[usize]) {
+        let tone = gains.adapted_tone(adaptation, 1);
         self.pieces.par_iter_mut().zip(photo_of).for_each(|(piece, &photo)| {
             let correction = ExposureCorrection::new(&tone, gains, photo);
+            let b = piece.warped.bounds;
             let pixels = piece.warped.pixels.as_mut_slice().as_chunks_mut::<4>().0;
-            for (p, r2) in pixels.iter_mut().zip(&piece.radius) {
-                let color = correction.levels([p[0], p[1], p[2]].map(f32::from), correction.vignetting_stops(*r2));
+            for (i, (p, r2)) in pixels.iter_mut().zip(&piece.radius).enumerate() {
+                let (levels, mut lift) = ([p[0], p[1], p[2]].map(f32::from), correction.vignetting_stops(*r2));
+                if let Some(adaptation) = adaptation {
+                    let guide = correction.log_luminance(luma_f32(levels)) + lift;
+                    lift += adaptation.at_preview(b.left + i % b.width(), b.top + i / b.width(), guide);
+                }
+                let color = correction.levels(levels, lift);
                 let [r, g, b] = color.map(|v| (v + 0.5) as u8);
                 *p = [r, g, b, p[3]];
             }

@@ -1,5 +1,6 @@
 //! Jobs on generated scenes against ground truth. One binary: each further one takes as long to compile as its tests run.
 
+mod adapted;
 mod borders;
 mod dense;
 mod filled;
