@@ -3,6 +3,7 @@
 use crate::align::Alignment;
 use crate::bit_depth::{Channel, EightBits, PhotoSample};
 use crate::blend::{BlendMode, Blender, Composition, NO_PHOTO, of_mode};
+use crate::brackets;
 use crate::photometric::{
     Adaptation, Exposure, ExposureCorrection, Gains, Tone, decode_radiance, estimate_gains, fill_saturated,
     relative_gains,
@@ -136,6 +137,8 @@ pub struct Panorama<T = u8> {
     pub reaches_beyond: bool,
     /// Photometric parameters.
     pub gains: Gains,
+    /// Exposure brackets: photographs of the same view with different exposures, by ascending indices; at least two each. Their seams prefer the best exposed of them where it is not clipped.
+    pub stacks: Vec<Vec<usize>>,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
@@ -199,6 +202,8 @@ pub(crate) fn draw<T: PhotoSample>(
     clock.lap("preview");
     let gains = estimate_gains(&preview, &photo_of, photos.len(), options.exposure, progress)?;
     let adaptation = Adaptation::new(&preview, &gains, &photo_of, options.exposure, &layout, progress)?;
+    let stacks = brackets::stacks(alignment, &gains);
+    brackets::set_costs(&mut preview, &stacks, &photo_of, &Stage::new(progress, "exposure", 1)?)?;
     if options.exposure != Exposure::None {
         preview.correct(&gains, adaptation.as_ref(), &photo_of);
     }
@@ -264,6 +269,7 @@ pub(crate) fn draw<T: PhotoSample>(
         full_circle: layout.full_circle,
         reaches_beyond: layout.reaches_beyond,
         gains,
+        stacks,
         stages: Vec::new(),
     };
     if options.crop {

@@ -375,6 +375,7 @@ fn outcome<T: PhotoSample>(paths: &[PathBuf], result: &PanoramaResult<T>) -> Out
         .with("images", images)
         .with("size", [w, h])
         .with("reprojection_rms_px", result.reprojection_rms_px)
+        .with("stacks", result.stacks.clone())
         .with("projection", result.canvas.projection.to_string())
         .with("mode", result.alignment.motion.to_string())
         .with("bits", if result.radiance.is_some() { 32 } else { 8 * size_of::<T>() })

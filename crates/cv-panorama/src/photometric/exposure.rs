@@ -385,7 +385,8 @@ mod tests {
         let clipped = vec![false; radius.len()];
         let colors = pixels.pixels().flat_map(|p| [p[0], p[1], p[2]]);
         let mean_level = colors.map(f64::from).sum::<f64>() / (3 * radius.len()) as f64;
-        Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: radius.clone(), radius, clipped, mean_level }
+        let warped = WarpedPhoto { bounds, pixels };
+        Piece { warped, eccentricity: radius.clone(), radius, clipped, mean_level, cost: Vec::new() }
     }
 
     /// Three photographs of 60 x 40, 30 apart, of one scene, their light multiplied by known factors and less toward their corners.

@@ -6,7 +6,7 @@ mod radiance;
 mod response;
 mod tone;
 
-pub(crate) use adaptation::Adaptation;
+pub(crate) use adaptation::{Adaptation, mean_stops, well_exposed};
 pub use exposure::{Exposure, Gains};
 pub(crate) use exposure::{SATURATED_LEVEL, estimate_gains};
 pub(crate) use radiance::{decode_radiance, fill_saturated, relative_gains};

@@ -15,6 +15,7 @@ pub(crate) use scratch::WarpedStore;
 use crate::align::Alignment;
 use crate::bit_depth::PhotoSample;
 use crate::blend::NO_PHOTO;
+use crate::brackets;
 use crate::photometric::{Adaptation, Exposure, Gains, estimate_gains};
 use crate::regions::regions;
 use crate::render::{CompositingOptions, Drawing, PREVIEW_PIXELS, Panorama, RenderError, check, draw};
@@ -236,6 +237,8 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     clock.lap("preview");
     let gains = estimate_gains(&preview, &photo_of, alignment.views.len(), options.exposure, progress)?;
     let adaptation = Adaptation::new(&preview, &gains, &photo_of, options.exposure, &layout, progress)?;
+    let stacks = brackets::stacks(alignment, &gains);
+    brackets::set_costs(&mut preview, &stacks, &photo_of, &Stage::new(progress, "exposure", 1)?)?;
     if options.exposure != Exposure::None {
         preview.correct(&gains, adaptation.as_ref(), &photo_of);
     }
@@ -298,6 +301,7 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
         full_circle: layout.full_circle && shown.width() == canvas.0,
         reaches_beyond: layout.reaches_beyond,
         gains,
+        stacks,
         stages: clock.into_stages(),
     };
     panorama.map.crop(shown.left, shown.top);

@@ -29,6 +29,8 @@ pub(crate) struct Piece {
     pub(crate) clipped: Vec<bool>,
     /// Mean level of the photograph's samples.
     pub(crate) mean_level: f64,
+    /// Data term of the seams at each pixel, for photographs of exposure brackets; empty for none.
+    pub(crate) cost: Vec<f32>,
 }
 
 impl Piece {
@@ -49,6 +51,14 @@ impl Piece {
             let places = (0..height).flat_map(|y| (0..width).map(move |x| corner(x, y)));
             places.map(|(x, y)| values[y * b.width() + x]).collect()
         };
+        let greatest = |values: &[f32]| {
+            let places = (0..height).flat_map(|y| (0..width).map(move |x| corner(x, y)));
+            let greatest = |(x, y): (usize, usize)| {
+                let four = [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)];
+                four.iter().map(|(x, y)| values[y * b.width() + x]).fold(0.0, f32::max)
+            };
+            places.map(greatest).collect()
+        };
         let clipped = (0..width * height).map(|i| {
             let (x, y) = corner(i % width, i / width);
             [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)].iter().any(|(x, y)| self.clipped[y * b.width() + x])
@@ -59,6 +69,7 @@ impl Piece {
             radius: at_corners(&self.radius),
             clipped: clipped.collect(),
             mean_level: self.mean_level,
+            cost: if self.cost.is_empty() { Vec::new() } else { greatest(&self.cost) },
         }
     }
 }
@@ -140,7 +151,7 @@ impl Preview {
             let clipped = pixels.map(|p| p[..3].iter().any(|v| *v >= SATURATED_LEVEL)).collect();
             let samples = photo.as_slice();
             let mean_level = samples.iter().map(|v| u64::from(*v)).sum::<u64>() as f64 / samples.len().max(1) as f64;
-            Ok(Some(Piece { warped, eccentricity, radius, clipped, mean_level }))
+            Ok(Some(Piece { warped, eccentricity, radius, clipped, mean_level, cost: Vec::new() }))
         };
         let pieces: Vec<Option<Piece>> =
             layout.placements.par_iter().enumerate().map(draw).collect::<Result<_, Cancelled>>()?;
@@ -290,6 +301,7 @@ mod tests {
             radius: numbered,
             clipped: (0..35).map(|i| i == 8).collect(),
             mean_level: 0.0,
+            cost: Vec::new(),
         };
         let half = piece.halved();
         assert_eq!(half.warped.bounds, Bounds { left: 2, top: 1, right: 5, bottom: 3 });
@@ -312,6 +324,7 @@ mod tests {
             radius: vec![0.0],
             clipped: vec![false],
             mean_level: 9.0,
+            cost: Vec::new(),
         }
         .halved();
         assert!(half.warped.pixels.is_empty() && half.radius.is_empty());

@@ -1,9 +1,9 @@
 //! Local adaptation of panoramas ([`Exposure::Adapt`]) on photographs of known exposure and registration.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
+
 use cv_core::{Camera, Point2, RgbU8, Rotation3, Silent, Vector3};
-use cv_panorama::{
-    Alignment, BlendMode, CameraMotion, CompositingOptions, Exposure, Panorama, Seams, View, render,
-};
+use cv_panorama::{Alignment, BlendMode, CameraMotion, CompositingOptions, Exposure, Panorama, Seams, View, render};
 use cv_synth::{Vista, VistaOptions, VistaPhoto, vista_photos, vista_response};
 
 fn alignment(views: Vec<View>) -> Alignment {
@@ -60,19 +60,27 @@ fn every_part_has_the_mean_level_of_its_photograph() {
     assert_eq!((matched.size, &matched.gains), (adapted.size, &adapted.gains));
     let mut farthest: f64 = 0.0;
     for (index, photo) in images.iter().enumerate() {
-        let (mut levels, mut n) = ([0.0; 3], 0.0);
+        let alone = |x: usize, y: usize| {
+            let place = Point2::new(x as f64, y as f64);
+            (0..images.len()).filter(|&k| k != index).all(|k| adapted.map.source(k, place).is_none())
+        };
+        // Of all, and of what no other photograph shows: its own mean level, matched and adapted, and the number of pixels.
+        let mut sums = [[0.0; 4]; 2];
         inner(&adapted, index, photo, |x, y, own| {
-            let all = [own, matched.image.at(x, y), adapted.image.at(x, y)];
-            (0..3).for_each(|k| levels[k] += mean(all[k]));
-            n += 1.0;
+            let all = [own, matched.image.at(x, y), adapted.image.at(x, y)].map(mean);
+            for sum in sums.iter_mut().take(if alone(x, y) { 2 } else { 1 }) {
+                (0..3).for_each(|k| sum[k] += all[k]);
+                sum[3] += 1.0;
+            }
         });
-        let [own, matched, adapted] = levels.map(|sum| sum / n);
-        let (before, after) = ((matched - own).abs(), (adapted - own).abs());
-        farthest = farthest.max(before);
-        // The inner half has vignetting of up to a tenth, five levels, which is corrected; and neighbors of other exposures overlap it by a fifth. Where the common exposure is that of the
-        // photograph, it is near too.
-        assert!(after < before || after < 6.0, "{index}: {own:.1}, matched {matched:.1}, adapted {adapted:.1}");
-        assert!(after < 14.0, "{index}: {own:.1}, matched {matched:.1}, adapted {adapted:.1}");
+        let [[own, before, after], alone] = sums.map(|s| [s[0] / s[3], s[1] / s[3], s[2] / s[3]]);
+        println!("{index}: {own:.1}, matched {before:.1}, adapted {after:.1}; alone {alone:.1?} of {}", sums[1][3]);
+        let off = |level: f64| (level - own).abs();
+        farthest = farthest.max(off(before));
+        // Nearer, unless the common exposure happens to be that of the photograph: the inner half reaches to the middle of overlaps with photographs of up to four stops more.
+        assert!(off(after) < 0.6 * off(before) || off(after) < 6.0, "{index}: {own:.1}, {before:.1}, {after:.1}");
+        // Vignetting, which is corrected, is 3 % of the light on average there: two levels. The transitions to its neighbors do the rest.
+        assert!(sums[1][3] > 500.0 && (alone[2] - alone[0]).abs() < 10.0, "{index}: {alone:.1?}");
     }
     assert!(farthest > 40.0, "{farthest}: the set shows no need");
 }
@@ -91,16 +99,16 @@ fn what_is_clipped_in_every_photograph_stays_white() {
             adapted.map.source(index, place).map(|p| {
                 let around = |v: f64, n: usize| (v as usize).saturating_sub(2)..(v as usize + 4).min(n);
                 let places = around(p.y, photo.height()).flat_map(|v| around(p.x, photo.width()).map(move |u| (u, v)));
-                places.into_iter().all(|(u, v)| photo.at(u, v) == [255; 3])
+                places.into_iter().all(|(u, v)| photo.at(u, v).iter().all(|v| *v >= 250))
             })
         };
         let seen: Vec<bool> = images.iter().enumerate().filter_map(|(i, photo)| is_clipped(i, photo)).collect();
         if !seen.is_empty() && seen.iter().all(|clipped| *clipped) {
             white += 1;
-            dark += usize::from(adapted.image.at(x, y).iter().any(|v| *v < 250));
+            dark += usize::from(adapted.image.at(x, y).iter().any(|v| *v < 245));
         }
     }
-    // Bands of other wavelengths reach across borders of the clipped region.
+    // Level 250 counts as clipped to 98 %, and noise is as large. Bands of other wavelengths reach across the borders of the clipped region.
     assert!(white > 2000 && dark * 100 < white, "{dark} of {white}");
 }
 
@@ -118,11 +126,19 @@ fn seams_have_no_steps() {
         for (x, y) in (0..h).flat_map(|y| (4..w - 4).map(move |x| (x, y))) {
             let one = |x: usize| p.labels.at(x, y) == p.labels.at(x - 1, y);
             let is_covered = (x - 4..x + 4).all(|x| p.mask.at(x, y)[0]);
-            // What is clipped on one side only is no error of the tone.
-            let is_tonal = (x - 4..x + 4).all(|x| (12.0..235.0).contains(&level(x, y)));
+            // What one of the two photographs cannot show is no error of the tone: where it is clipped in a channel, or in the noise.
+            let place = Point2::new(x as f64, y as f64);
+            let is_tonal = [p.labels.at(x, y)[0], p.labels.at(x - 1, y)[0]].iter().all(|label| {
+                let photo = images.get(usize::from(*label));
+                let source = photo.and_then(|photo| Some((photo, p.map.source(usize::from(*label), place)?)));
+                source.is_some_and(|(photo, p)| {
+                    photo.at(p.x.round() as usize, p.y.round() as usize).iter().all(|v| (12..235).contains(v))
+                })
+            });
             if is_covered && is_tonal && !one(x) && one(x - 2) && one(x + 2) {
                 across += (level(x, y) - level(x - 1, y)).abs();
-                beside += 0.5 * (level(x - 2, y) - level(x - 3, y)).abs() + 0.5 * (level(x + 2, y) - level(x + 1, y)).abs();
+                beside +=
+                    0.5 * (level(x - 2, y) - level(x - 3, y)).abs() + 0.5 * (level(x + 2, y) - level(x + 1, y)).abs();
                 n += 1.0;
             }
         }

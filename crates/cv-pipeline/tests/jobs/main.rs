@@ -2,6 +2,7 @@
 
 mod adapted;
 mod borders;
+mod brackets;
 mod dense;
 mod filled;
 mod flat_map;
