@@ -29,10 +29,10 @@ const SEAM_REACH: usize = 4;
 const DARK_LEVEL: f32 = 32.0;
 /// Ratio of the levels of two photographs from which on the brighter one is less noisy: 1.3 stops.
 const BRIGHTER_RATIO: f32 = 1.5;
-/// Data term of a black pixel where another photograph of the stack is brighter: a region of some twenty pixels is worth a seam through noise around it.
-const DARK_COST: f32 = 12.0;
-/// Data term of photographs of a stack other than the base: with the base's eccentricity term of 0 to 4 it decides only where photographs agree.
-const OTHER_COST: f32 = 2.0;
+/// Data term of a black pixel where another photograph of the stack is brighter, falling to 0 at [`DARK_LEVEL`]: with [`OTHER_COST`] it decides below three quarters of that.
+const DARK_COST: f32 = 40.0;
+/// Data term of photographs of a stack other than the base. More than the eccentricity term, at most 4; a region of some forty pixels is worth a seam of three levels of noise in every channel around it.
+const OTHER_COST: f32 = 10.0;
 
 /// Returns the stacks: indices of the photographs, ascending, in the order of their first.
 pub(crate) fn stacks(alignment: &Alignment, gains: &Gains) -> Vec<Vec<usize>> {

@@ -104,7 +104,6 @@ fn brackets_are_stacks_of_which_nothing_is_clipped_or_cut() {
                 }
             }
         }
-        println!("{blend:?}: {lost} lost, {white} white of {shown}; {own} of the middle exposure; persons {parts:?}");
         // What some photograph saw unclipped: 99.5 %.
         assert!(lost * 200 <= shown && white * 200 <= shown, "{blend:?}: {lost} and {white} of {shown}");
         // The middle exposures clip the sky and show most of the rest.
