@@ -5,10 +5,11 @@
 //! where it is clipped or in the noise. As the smoothness term keeps seams out of differences, what moves between exposures comes from one photograph: it is whole or absent.
 
 use crate::align::{Alignment, View};
-use crate::photometric::{Gains, SATURATED_LEVEL, mean_stops, well_exposed};
+use crate::photometric::{Gains, mean_stops, well_exposed};
+use crate::rows::for_each_row;
 use crate::surface::{Piece, Preview};
-use cv_core::{Cancelled, Mask, Point2, Stage, luma_f32};
-use cv_imgproc::{StructuringElement, dilate};
+use cv_core::{Cancelled, Mask, Point2, Stage, luma_u8};
+use cv_imgproc::{StructuringElement, dilate, erode};
 use rayon::prelude::*;
 
 /// Maximum displacement of a pixel between two photographs of a stack, relative to the longer side: a handheld burst. The overlap is at least 95 %.
@@ -33,6 +34,13 @@ const BRIGHTER_RATIO: f32 = 1.5;
 const DARK_COST: f32 = 40.0;
 /// Data term of photographs of a stack other than the base. More than the eccentricity term, at most 4; a region of some forty pixels is worth a seam of three levels of noise in every channel around it.
 const OTHER_COST: f32 = 10.0;
+
+/// Sum of absolute differences over channels, after exposure compensation, beyond which two photographs show different things: four times the noise of dark levels that are brightened by two stops.
+const MIN_GHOST_DIFFERENCE: i32 = 90;
+/// Range of luma in which photographs are compared: below it levels are noise, above it they are corrected toward white.
+const COMPARED_LEVELS: std::ops::Range<u8> = 8..228;
+/// Radius, in preview pixels, of misaligned edges, which are no ghosts, and by how much ghosts are grown, to their outlines.
+const GHOST_RADII: [usize; 2] = [1, 4];
 
 /// Returns the stacks: indices of the photographs, ascending, in the order of their first.
 pub(crate) fn stacks(alignment: &Alignment, gains: &Gains) -> Vec<Vec<usize>> {
@@ -66,21 +74,36 @@ fn is_same_view(a: &View, b: &View) -> bool {
     })
 }
 
-/// Sets the data terms of the pieces of stacks, before their exposure is corrected.
+/// Returns the luma of the pieces of stacks, for [`set_costs`], before their exposure is corrected; nothing for other pieces.
+pub(crate) fn lumas(preview: &Preview, stacks: &[Vec<usize>], photo_of: &[usize]) -> Vec<Vec<u8>> {
+    let luma = |(piece, photo): (&Piece, &usize)| -> Vec<u8> {
+        let is_member = stacks.iter().any(|stack| stack.contains(photo));
+        let pixels = piece.warped.pixels.pixels().filter(|_| is_member);
+        pixels.map(|[r, g, b, _]| luma_u8([r, g, b])).collect()
+    };
+    preview.pieces.iter().zip(photo_of).map(luma).collect()
+}
+
+/// Sets the data terms of the pieces of stacks, after their exposure is corrected.
+///
+/// Where photographs of a stack differ beyond noise, something moved: there only clipped pixels have a cost, so that preferences do not cut it.
 pub(crate) fn set_costs(
     preview: &mut Preview,
     stacks: &[Vec<usize>],
     photo_of: &[usize],
+    lumas: &[Vec<u8>],
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
     for stack in stacks {
         let members: Vec<usize> = (0..photo_of.len()).filter(|&k| stack.contains(&photo_of[k])).collect();
-        let base = base(preview, &members, photo_of);
+        let stack = Stack { preview, lumas, photo_of, members: &members };
+        let base = stack.base();
+        let ghosts = stack.ghosts(stage)?;
         let costs: Vec<Vec<f32>> = members
             .par_iter()
             .map(|&k| {
                 stage.check()?;
-                Ok(costs(preview, k, &members, photo_of, base))
+                Ok(stack.costs(k, base, &ghosts))
             })
             .collect::<Result<_, Cancelled>>()?;
         for (&k, costs) in members.iter().zip(costs) {
@@ -90,63 +113,108 @@ pub(crate) fn set_costs(
     Ok(())
 }
 
-/// Returns the best exposed photograph of a stack, by the mean weight of its pixels; the first of equals.
-fn base(preview: &Preview, members: &[usize], photo_of: &[usize]) -> usize {
-    let score = |k: usize| {
-        let (mut sum, mut n) = (0.0, 0.0_f64);
-        for (color, is_clipped) in preview.pieces[k].warped.pixels.pixels().zip(&preview.pieces[k].clipped) {
-            if color[3] > 0 {
-                let luma = luma_f32([color[0], color[1], color[2]].map(f32::from));
-                sum += f64::from(well_exposed(luma / 255.0, *is_clipped));
-                n += 1.0;
-            }
-        }
-        sum / n.max(1.0)
-    };
-    let best = members.iter().map(|&k| (score(k), photo_of[k])).reduce(|a, b| if b.0 > a.0 { b } else { a });
-    best.map_or(0, |(_, photo)| photo)
+/// The pieces of a stack.
+struct Stack<'a> {
+    preview: &'a Preview,
+    /// By piece, before exposure compensation.
+    lumas: &'a [Vec<u8>],
+    photo_of: &'a [usize],
+    members: &'a [usize],
 }
 
-fn costs(preview: &Preview, k: usize, members: &[usize], photo_of: &[usize], base: usize) -> Vec<f32> {
-    let piece = &preview.pieces[k];
-    let others: Vec<&Piece> =
-        members.iter().filter(|&&m| photo_of[m] != photo_of[k]).map(|&m| &preview.pieces[m]).collect();
-    let b = piece.warped.bounds;
-    let (width, height) = (b.width(), b.height());
-    let is_clipped = |piece: &Piece, x: usize, y: usize| {
-        let own = piece.warped.bounds;
-        piece.clipped[(y - own.top) * own.width() + x - own.left]
-    };
-    // The luma of the brightest of the others that is not clipped at a pixel.
-    let shown = |x: usize, y: usize| {
-        let unclipped = others.iter().filter(|other| other.warped.reaches(x, y) && !is_clipped(other, x, y));
-        let lumas = unclipped.filter_map(|other| other.warped.color(x, y)).map(|c| luma_f32(c.map(f32::from)));
-        lumas.reduce(f32::max)
-    };
-    let clipped = Mask::from_fn(width, height, |x, y| [piece.clipped[y * width + x]]);
-    let near = dilate(clipped.view(), &StructuringElement::square(SEAM_REACH));
-    let own = if photo_of[k] == base { 0.0 } else { OTHER_COST };
-    let cost = |i: usize| {
-        let (x, y) = (b.left + i % width, b.top + i / width);
-        let (Some(color), Some(other)) = (piece.warped.color(x, y), shown(x, y)) else { return own };
-        let luma = luma_f32(color.map(f32::from));
-        let exposure = match (piece.clipped[i], near.at(i % width, i / width)[0]) {
-            (true, _) => CLIPPED_COST,
-            (false, true) => NEAR_CLIPPED_COST,
-            _ if other >= BRIGHTER_RATIO * luma && other < f32::from(SATURATED_LEVEL) => {
-                DARK_COST * (1.0 - luma / DARK_LEVEL).max(0.0)
+impl Stack<'_> {
+    /// Returns luma before exposure compensation, and whether a channel is clipped, of a piece at a preview pixel that it covers.
+    fn at(&self, k: usize, x: usize, y: usize) -> Option<(u8, bool)> {
+        let piece = &self.preview.pieces[k];
+        let b = piece.warped.bounds;
+        piece.warped.reaches(x, y).then(|| {
+            let i = (y - b.top) * b.width() + x - b.left;
+            (self.lumas[k][i], piece.clipped[i])
+        })
+    }
+
+    /// Returns the best exposed photograph, by the mean weight of its pixels; the first of equals.
+    fn base(&self) -> usize {
+        let score = |k: usize| {
+            let piece = &self.preview.pieces[k];
+            let (mut sum, mut n) = (0.0, 0.0_f64);
+            for ((color, luma), is_clipped) in piece.warped.pixels.pixels().zip(&self.lumas[k]).zip(&piece.clipped) {
+                if color[3] > 0 {
+                    sum += f64::from(well_exposed(f32::from(*luma) / 255.0, *is_clipped));
+                    n += 1.0;
+                }
             }
-            _ => 0.0,
+            sum / n.max(1.0)
         };
-        own + exposure
-    };
-    (0..width * height).map(cost).collect()
+        let scored = self.members.iter().map(|&k| (score(k), self.photo_of[k]));
+        scored.reduce(|a, b| if b.0 > a.0 { b } else { a }).map_or(0, |(_, photo)| photo)
+    }
+
+    /// Returns the preview pixels where photographs differ beyond noise.
+    fn ghosts(&self, stage: &Stage<'_>) -> Result<Mask, Cancelled> {
+        let mut ghosts = Mask::new(self.preview.width, self.preview.height, [false]);
+        for_each_row(ghosts.as_mut_slice(), self.preview.width, stage, |y, row| {
+            let mut shown: Vec<[u8; 3]> = Vec::new();
+            for (x, ghost) in row.iter_mut().enumerate() {
+                shown.clear();
+                for &k in self.members {
+                    let measured =
+                        self.at(k, x, y).filter(|(luma, clipped)| COMPARED_LEVELS.contains(luma) && !clipped);
+                    let is_measured = measured.is_some();
+                    shown.extend(self.preview.pieces[k].warped.color(x, y).filter(|_| is_measured));
+                }
+                let differ = |a: &[u8; 3], b: &[u8; 3]| {
+                    let off = a.iter().zip(b).map(|(a, b)| i32::from(a.abs_diff(*b))).sum::<i32>();
+                    off > MIN_GHOST_DIFFERENCE
+                };
+                *ghost = shown.iter().enumerate().any(|(i, a)| shown[i + 1..].iter().any(|b| differ(a, b)));
+            }
+        })?;
+        let [edges, grown] = GHOST_RADII;
+        let core = erode(ghosts.view(), &StructuringElement::square(edges));
+        Ok(dilate(core.view(), &StructuringElement::square(edges + grown)))
+    }
+
+    /// Returns the data term of each pixel of a piece.
+    fn costs(&self, k: usize, base: usize, ghosts: &Mask) -> Vec<f32> {
+        let piece = &self.preview.pieces[k];
+        let b = piece.warped.bounds;
+        let (width, height) = (b.width(), b.height());
+        let clipped = Mask::from_fn(width, height, |x, y| [piece.clipped[y * width + x]]);
+        let near = dilate(clipped.view(), &StructuringElement::square(SEAM_REACH));
+        // The luma of the brightest of the others that is not clipped at a pixel.
+        let brightest = |x: usize, y: usize| {
+            let others = self.members.iter().filter(|&&m| self.photo_of[m] != self.photo_of[k]);
+            others.filter_map(|&m| self.at(m, x, y)).filter(|(_, clipped)| !clipped).map(|(luma, _)| luma).max()
+        };
+        let preference = if self.photo_of[k] == base { 0.0 } else { OTHER_COST };
+        let cost = |i: usize| {
+            let (x, y) = (b.left + i % width, b.top + i / width);
+            let is_ghost = ghosts.at(x, y)[0];
+            let own = if is_ghost { 0.0 } else { preference };
+            let (Some((luma, is_clipped)), Some(other)) = (self.at(k, x, y), brightest(x, y)) else { return own };
+            let (luma, other) = (f32::from(luma), f32::from(other));
+            if is_clipped {
+                own + CLIPPED_COST
+            } else if is_ghost {
+                0.0
+            } else if near.at(i % width, i / width)[0] || luma >= f32::from(COMPARED_LEVELS.end) {
+                own + NEAR_CLIPPED_COST
+            } else if other >= BRIGHTER_RATIO * luma {
+                own + DARK_COST * (1.0 - luma / DARK_LEVEL).max(0.0)
+            } else {
+                own
+            }
+        };
+        (0..width * height).map(cost).collect()
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::align::CameraMotion;
+    use crate::photometric::SATURATED_LEVEL;
     use crate::seams::{Seams, on_preview};
     use crate::surface::Bounds;
     use crate::testing::{drawn, stage};
@@ -192,7 +260,7 @@ mod tests {
         let bounds = Bounds { left: 0, top: 0, right: SIZE.0, bottom: SIZE.1 };
         let piece = |k: usize| {
             let light = |x: usize, y: usize| match (x, y) {
-                (60..72, 5..60) if k == 1 => 0.1,
+                (60..72, 5..95) if k == 1 => 0.1,
                 (_, 0..15) => 1.5 + 0.5 * (x as f32 * 0.3).sin(),
                 (_, 15..65) => 0.3 + 0.1 * (x as f32 * 0.5).sin(),
                 _ => 0.001,
@@ -219,9 +287,19 @@ mod tests {
     #[test]
     fn the_best_exposed_is_the_base_and_others_are_taken_where_it_is_clipped_or_dark() {
         let (mut preview, gains) = bracket();
-        set_costs(&mut preview, &[vec![0, 1, 2]], &[0, 1, 2], &stage()).unwrap();
-        assert_eq!(base(&preview, &[0, 1, 2], &[0, 1, 2]), 1);
-        preview.correct(&gains, None, &[0, 1, 2]);
+        let photo_of = [0, 1, 2];
+        let lumas = lumas(&preview, &[vec![0, 1, 2]], &photo_of);
+        let stack = Stack { preview: &preview, lumas: &lumas, photo_of: &photo_of, members: &photo_of };
+        assert_eq!(stack.base(), 1);
+        preview.correct(&gains, None, &photo_of);
+        let stack = Stack { preview: &preview, lumas: &lumas, photo_of: &photo_of, members: &photo_of };
+        let ghosts = stack.ghosts(&stage()).unwrap();
+        for (x, y) in (0..SIZE.1).flat_map(|y| (0..SIZE.0).map(move |x| (x, y))) {
+            // Four pixels around the person.
+            assert!(!ghosts.at(x, y)[0] || (56..76).contains(&x) && (1..99).contains(&y), "{x} {y}");
+            assert!(ghosts.at(x, y)[0] || !(60..72).contains(&x) || !(5..95).contains(&y), "{x} {y}");
+        }
+        set_costs(&mut preview, &[vec![0, 1, 2]], &photo_of, &lumas, &stage()).unwrap();
         let labels = on_preview(&preview, &[0, 1, 2], Seams::GraphCut, false, false, &Silent).unwrap();
         let at = |x: usize, y: usize| labels.at(x, y)[0];
         for x in (5..50).chain(85..155) {
@@ -230,7 +308,7 @@ mod tests {
             assert!((72..98).all(|y| at(x, y) == 2), "shadow {x}");
         }
         // The person is whole or absent.
-        let places = || (6..59).flat_map(|y| (61..71).map(move |x| (x, y)));
+        let places = || (6..94).flat_map(|y| (61..71).map(move |x| (x, y)));
         let own = places().filter(|&(x, y)| at(x, y) == 1).count();
         assert!(own == 0 || own == places().count(), "{own} of {}", places().count());
     }
@@ -238,11 +316,12 @@ mod tests {
     #[test]
     fn photographs_that_are_no_bracket_have_no_costs() {
         let (mut preview, _) = bracket();
-        set_costs(&mut preview, &[], &[0, 1, 2], &stage()).unwrap();
+        set_costs(&mut preview, &[], &[0, 1, 2], &[], &stage()).unwrap();
         assert!(preview.pieces.iter().all(|piece| piece.cost.is_empty()));
         // Of a bracket clipped everywhere, none is better than another.
         preview.pieces.iter_mut().for_each(|piece| piece.clipped.fill(true));
-        set_costs(&mut preview, &[vec![0, 1]], &[0, 1, 2], &stage()).unwrap();
+        let lumas = lumas(&preview, &[vec![0, 1]], &[0, 1, 2]);
+        set_costs(&mut preview, &[vec![0, 1]], &[0, 1, 2], &lumas, &stage()).unwrap();
         let kinds = preview.pieces[..2].iter().flat_map(|piece| &piece.cost).filter(|c| **c > OTHER_COST).count();
         assert_eq!((kinds, preview.pieces[2].cost.len()), (0, 0));
     }

@@ -203,10 +203,11 @@ pub(crate) fn draw<T: PhotoSample>(
     let gains = estimate_gains(&preview, &photo_of, photos.len(), options.exposure, progress)?;
     let adaptation = Adaptation::new(&preview, &gains, &photo_of, options.exposure, &layout, progress)?;
     let stacks = brackets::stacks(alignment, &gains);
-    brackets::set_costs(&mut preview, &stacks, &photo_of, &Stage::new(progress, "exposure", 1)?)?;
+    let lumas = brackets::lumas(&preview, &stacks, &photo_of);
     if options.exposure != Exposure::None {
         preview.correct(&gains, adaptation.as_ref(), &photo_of);
     }
+    brackets::set_costs(&mut preview, &stacks, &photo_of, &lumas, &Stage::new(progress, "exposure", 1)?)?;
     clock.lap("exposure");
     let coarse =
         seams::on_preview(&preview, &photo_of, options.seams, options.radiance, options.removes_transients, progress)?;
