@@ -410,7 +410,7 @@ def panorama(
     clean: bool | None = False,
     keep: Sequence[_Mask | None] | None = None,
     remove: Sequence[_Mask | None] | None = None,
-    exposure: Literal["none", "match"] | None = "match",
+    exposure: Literal["none", "match", "adapt"] | None = "match",
     crop: bool | None = False,
     scale: float | None = 1.0,
     features: Literal["sift", "mops", "harris"] | None = "sift",

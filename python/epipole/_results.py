@@ -525,6 +525,8 @@ class Panorama(_Result):
     """By index: why a photograph is not registered."""
     registration: str
     """The registration as JSON: for `panorama(registration=...)` with other photographs of the same views, or as a file for `cv panorama --registration`."""
+    stacks: list[list[int]]
+    """Exposure brackets: indices of photographs of one view with different exposures."""
     rms: float
     """RMS residual of the matches, px of the photographs."""
     shows_parallax: bool

@@ -57,6 +57,32 @@ fn an_exr_has_the_radiance_at_the_exposure_of_the_reference() {
     let size = [0, 1].map(|i| value["size"][i].as_i64().unwrap());
     assert_eq!([0, 1, 2, 3].map(|k| i64::from(side(k))), [0, 0, size[0] - 1, size[1] - 1]);
     assert_eq!(run(folder.path(), &["panorama", &names[0], &names[1], "-o", "a.exr", "--alpha"]).code, Some(2));
+    // Radiance has no tone to adapt.
+    let adapted = run(folder.path(), &["panorama", &names[0], &names[1], "-o", "a.exr", "--exposure", "adapt"]);
+    assert_eq!(adapted.code, Some(2));
+    assert!(adapted.stderr.contains("--exposure match"), "{}", adapted.stderr);
+}
+
+#[test]
+fn brackets_are_reported_and_adaptation_is_the_same_when_streamed() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, mut names) = landscape(folder.path(), 2, 0.0);
+    // Each again with a quarter of the light.
+    for i in 0..2 {
+        let photo = cv_io::read_rgb(folder.path().join(&names[i])).unwrap();
+        let dark = photo.map(|c| c.map(|v| (f64::from(v) * 0.25_f64.powf(1.0 / 2.2)).round() as u8));
+        names.push(format!("{i}_dark.png"));
+        cv_io::write_png(folder.path().join(&names[2 + i]), dark.view()).unwrap();
+    }
+    let made = |output: &'static str, more: &[&'static str]| {
+        let args = [&["panorama"], &strs(&names)[..], &["-o", output], more].concat();
+        let value = json(folder.path(), &args);
+        assert_eq!(value["stacks"], serde_json::json!([[0, 2], [1, 3]]), "{output}: {value}");
+        cv_io::read_rgb(folder.path().join(output)).unwrap()
+    };
+    let matched = made("match.png", &[]);
+    let adapted = made("adapt.png", &["--exposure", "adapt"]);
+    assert!(adapted == made("streamed.png", &["--exposure", "adapt", "--max-memory", "300"]) && adapted != matched);
 }
 
 #[test]
@@ -482,7 +508,7 @@ fn a_limit_of_memory_changes_no_pixel() {
         let (whole, told) = made(photos, output, more);
         let (limited, also) = made(photos, output, &[more, &["--max-memory", "300"]].concat());
         assert!(whole.pixels == limited.pixels, "{output}");
-        for key in ["size", "bits", "images", "projection", "reprojection_rms_px"] {
+        for key in ["size", "bits", "images", "stacks", "projection", "reprojection_rms_px"] {
             assert_eq!(told[key], also[key], "{output} {key}");
         }
     }

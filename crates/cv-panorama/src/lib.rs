@@ -35,6 +35,7 @@
 mod align;
 mod bit_depth;
 mod blend;
+mod brackets;
 mod masks;
 mod photometric;
 mod regions;

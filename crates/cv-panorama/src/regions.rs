@@ -111,6 +111,7 @@ mod tests {
                 radius: vec![0.0; n],
                 clipped: vec![false; n],
                 mean_level: 9.0,
+                cost: Vec::new(),
             }
         };
         let preview = Preview { step: 4, width: SIZE.0, height: SIZE.1, pieces: boxes.iter().map(piece).collect() };

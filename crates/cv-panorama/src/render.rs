@@ -3,9 +3,11 @@
 use crate::align::Alignment;
 use crate::bit_depth::{Channel, EightBits, PhotoSample};
 use crate::blend::{BlendMode, Blender, Composition, NO_PHOTO, of_mode};
+use crate::brackets;
 use crate::masks::{PhotoMask, PlacedMasks, filled};
 use crate::photometric::{
-    Exposure, ExposureCorrection, Gains, Tone, decode_radiance, estimate_gains, fill_saturated, relative_gains,
+    Adaptation, Exposure, ExposureCorrection, Gains, Tone, decode_radiance, estimate_gains, fill_saturated,
+    relative_gains,
 };
 use crate::regions::{Region, regions};
 use crate::rows::for_each_row;
@@ -150,6 +152,8 @@ pub struct Panorama<T = u8> {
     pub reaches_beyond: bool,
     /// Photometric parameters.
     pub gains: Gains,
+    /// Exposure brackets: photographs of the same view with different exposures, by ascending indices; at least two each. Their seams prefer the best exposed of them where it is not clipped.
+    pub stacks: Vec<Vec<usize>>,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
@@ -238,10 +242,14 @@ pub(crate) fn draw<T: PhotoSample>(
     masked.remove(&mut preview);
     clock.lap("preview");
     let gains = estimate_gains(&preview, &photo_of, photos.len(), options.exposure, progress)?;
+    let adaptation = Adaptation::new(&preview, &gains, &photo_of, options.exposure, &layout, progress)?;
+    let stacks = brackets::stacks(alignment, &gains);
+    let lumas = brackets::lumas(&preview, &stacks, &photo_of);
     if options.exposure != Exposure::None {
-        preview.correct(&gains, &photo_of);
+        preview.correct(&gains, adaptation.as_ref(), &photo_of);
     }
     masked.keep(&mut preview);
+    brackets::set_costs(&mut preview, &stacks, &photo_of, &lumas, &Stage::new(progress, "exposure", 1)?)?;
     clock.lap("exposure");
     let coarse =
         seams::on_preview(&preview, &photo_of, options.seams, options.radiance, options.removes_transients, progress)?;
@@ -251,7 +259,14 @@ pub(crate) fn draw<T: PhotoSample>(
     // No canvas has more levels.
     let levels = blender.pyramid_levels(typical_side).min(16);
     let regions = regions(&coarse, &preview, &layout, levels);
-    let drawing = Drawing { layout: &layout, regions: &regions, fields: &fields, options, masks: &placed };
+    let drawing = Drawing {
+        layout: &layout,
+        regions: &regions,
+        fields: &fields,
+        options,
+        adaptation: adaptation.as_ref(),
+        masks: &placed,
+    };
     let warped = drawing.warped(photos, &gains, progress)?;
     clock.lap("warp");
     let mut labels = {
@@ -303,6 +318,7 @@ pub(crate) fn draw<T: PhotoSample>(
         full_circle: layout.full_circle,
         reaches_beyond: layout.reaches_beyond,
         gains,
+        stacks,
         stages: Vec::new(),
     };
     if options.crop {
@@ -356,6 +372,7 @@ pub(crate) struct Drawing<'a> {
     pub(crate) regions: &'a [Option<Region>],
     pub(crate) fields: &'a [Option<DisplacementField>],
     pub(crate) options: &'a CompositingOptions,
+    pub(crate) adaptation: Option<&'a Adaptation>,
     pub(crate) masks: &'a PlacedMasks<'a>,
 }
 
@@ -373,7 +390,7 @@ impl Drawing<'_> {
         progress: &dyn Progress,
     ) -> Result<Vec<Option<WarpedPhoto<T>>>, Cancelled> {
         let stage = Stage::new(progress, "warp", self.layout.placements.len())?;
-        let tone = gains.tone(T::PARTS);
+        let tone = gains.adapted_tone(self.adaptation, T::PARTS);
         let draw = |k: usize, region: &Region| {
             self.warped_one(photos[self.layout.placements[k].photo], k, region, gains, &tone, &stage)
         };
@@ -391,7 +408,9 @@ impl Drawing<'_> {
         stage: &Stage<'_>,
     ) -> Result<WarpedPhoto<T>, Cancelled> {
         let is_corrected = self.options.exposure != Exposure::None;
-        let correction = is_corrected.then(|| ExposureCorrection::new(tone, gains, self.layout.placements[k].photo));
+        let photo_index = self.layout.placements[k].photo;
+        let correction =
+            is_corrected.then(|| ExposureCorrection::new(tone, gains, photo_index).adapted(self.adaptation));
         let shrink = self.shrink();
         if shrink == 1 {
             return self.warp(photo, k, region.bounds, Some(region), correction, stage);
@@ -595,12 +614,12 @@ mod tests {
     fn defaults_change_nothing_where_nothing_is_to_be_done() {
         let set = Set::three();
         let panorama = set.render(&CompositingOptions::default());
-        // The canvas is brighter than every photograph, since overlaps count once; its mean is reduced to that of the brightest.
+        // The canvas is brighter than every photograph, since overlaps count once; its mean is reduced to a level below that of the brightest.
         let mean =
             |image: &RgbU8| image.as_slice().iter().map(|v| f64::from(*v)).sum::<f64>() / image.as_slice().len() as f64;
         let shown = mean_of_sky(&panorama);
-        let reduced = shown - set.photos.iter().map(mean).fold(0.0, f64::max);
-        assert!((0.0..2.0).contains(&reduced), "{reduced}");
+        let reduced = shown + 1.0 - set.photos.iter().map(mean).fold(0.0, f64::max);
+        assert!((1.0..3.0).contains(&reduced), "{reduced}");
         let (error, _) = error(&panorama);
         // Otherwise gains and displacements of noise only: a part in a thousand, a tenth of a pixel on slopes of ten levels.
         assert!(error < 1.0 + reduced, "{error} {reduced}");
@@ -877,6 +896,14 @@ mod tests {
             let (one, three) = (with(1), with(3));
             assert!(one.image == three.image && one.labels == three.labels, "{blend:?}");
         }
+        let fading: Vec<RgbU8> = (0..3).map(|i| set.photos[i].map(|c| c.map(|v| v >> i))).collect();
+        let fading: Vec<_> = fading.iter().map(RgbU8::view).collect();
+        let options = CompositingOptions { exposure: Exposure::Adapt, ..CompositingOptions::default() };
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| render(&fading, &set.alignment, &options, &Silent).unwrap().image)
+        };
+        assert!(with(1) == with(3));
         let deep: Vec<Image<u16, 3>> = set.photos.iter().map(|p| p.map(|c| c.map(|v| 250 * u16::from(v)))).collect();
         let views: Vec<_> = deep.iter().map(Image::view).collect();
         let options = CompositingOptions { radiance: true, ..CompositingOptions::default() };

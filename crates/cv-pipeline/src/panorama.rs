@@ -184,6 +184,8 @@ pub struct PanoramaResult<T = u8> {
     pub reaches_beyond: bool,
     /// Root mean square transfer error of all matches, in pixels of the photographs.
     pub reprojection_rms_px: f64,
+    /// Exposure brackets ([`Panorama::stacks`]).
+    pub stacks: Vec<Vec<usize>>,
     /// Stage names and their seconds.
     pub stages: Vec<(&'static str, f64)>,
 }
@@ -353,6 +355,7 @@ fn collected<T: PhotoSample>(
         map: drawn.map,
         reaches_beyond: drawn.reaches_beyond,
         reprojection_rms_px: alignment.rms_px,
+        stacks: drawn.stacks,
         alignment,
         stages: clock.into_stages(),
     })

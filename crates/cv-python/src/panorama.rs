@@ -344,6 +344,7 @@ fn made<T: PhotoSample + Element>(py: Python<'_>, found: PanoramaResult<T>) -> P
             ("gains", arrays::row_array(py, &gains)?),
             ("left_out", left_out.into_any()),
             ("registration", object(py, registration)?),
+            ("stacks", object(py, found.stacks)?),
             ("rms", object(py, found.reprojection_rms_px)?),
             ("shows_parallax", object(py, shows_parallax)?),
             ("seconds", results::stages(py, &found.stages)?),

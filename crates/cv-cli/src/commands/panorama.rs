@@ -40,6 +40,7 @@ const EIGHT_BIT_ENDINGS: &[&str] = &["jpg", "jpeg", "dzi"];
     cv panorama gigapixel/ -o huge.tif --max-memory 4096\n  \
     cv panorama gigapixel/ -o web/huge.dzi --max-memory 4096\n  \
     cv panorama window/*.jpg -o light.exr\n  \
+    cv panorama sunset/*.jpg -o pano.png --exposure adapt\n  \
     cv panorama wide/ -o pano.png --camera cam.yaml\n  \
     cv panorama wall/ -o plan.tif --mode plane\n  \
     cv panorama street/ -o wide.png --projection panini --fov 150,80\n  \
@@ -93,7 +94,8 @@ pub(crate) struct Args {
     /// photographs are kept, the one whose center is nearer is used.
     #[arg(long, value_name = "DIR|FILES", num_args = 1..)]
     keep: Vec<PathBuf>,
-    /// Exposure compensation: none, or match: exposures and white balances, with the camera response and vignetting, estimated jointly in linear intensity.
+    /// Exposure compensation: none; match: exposures and white balances, with the camera response and vignetting, estimated jointly in linear intensity; or adapt: as match, then every place in the
+    /// exposure of the photographs that show it, by a smooth local gain, for exposures that span more than about 1.5 stops.
     #[arg(long, value_name = "WHAT", value_parser = named::<Exposure>(), default_value_t = PanoramaOptions::default().render.exposure)]
     exposure: Exposure,
     /// Crop the result to the largest rectangle without empty pixels.
@@ -209,6 +211,10 @@ impl Run for Args {
         if self.clean && self.seams == Seams::Voronoi {
             return Err(Failure::usage("--clean has no effect with --seams voronoi, which ignores the content")
                 .advice("--seams graphcut"));
+        }
+        if self.exposure == Exposure::Adapt && self.ends_in(&["exr"]) {
+            return Err(Failure::usage("--exposure adapt has no effect on .exr outputs: radiance is not toned")
+                .advice("--exposure match, or an output as .tif"));
         }
         if self.layers.is_some() && (self.blend == BlendMode::Poisson || self.ends_in(&["exr"])) {
             return Err(Failure::usage("--layers cannot be combined with --blend poisson and .exr outputs")
@@ -386,6 +392,7 @@ fn outcome<T: PhotoSample>(paths: &[PathBuf], result: &PanoramaResult<T>) -> Out
         .with("images", images)
         .with("size", [w, h])
         .with("reprojection_rms_px", result.reprojection_rms_px)
+        .with("stacks", result.stacks.clone())
         .with("projection", result.canvas.projection.to_string())
         .with("mode", result.alignment.motion.to_string())
         .with("bits", if result.radiance.is_some() { 32 } else { 8 * size_of::<T>() })

@@ -5,7 +5,7 @@
 //! a log gain `g` per photograph and channel, and common vignetting `v(r) = v₁ r² + v₂ r⁴`. This is linear in all unknowns and solved by iteratively reweighted
 //! least squares (Cauchy weights). A clipped level is a lower bound: an equation only where the other photograph violates it.
 
-use crate::photometric::{ExposureCorrection, Response, Tone, response::COEFFICIENT_COUNT};
+use crate::photometric::{Adaptation, ExposureCorrection, Response, Tone, response::COEFFICIENT_COUNT};
 use crate::surface::{Piece, Preview};
 use cv_core::{Cancelled, Progress, Stage, named};
 use nalgebra::{DMatrix, DVector};
@@ -18,9 +18,13 @@ pub enum Exposure {
     /// Exposure and white balance of each photograph in linear radiance, with the response and the vignetting of the camera.
     #[default]
     Match,
+    /// As [`Self::Match`], then every place in the exposure of the photographs that show it, by a smooth lift in log radiance that follows edges: where exposures span more than 1.5 stops, one
+    /// exposure is too dark or washed out. Up to a range of half a stop the same as `Match`. Radiance ([`CompositingOptions::radiance`](crate::CompositingOptions::radiance)) has no
+    /// exposure, and is the same as with `Match`.
+    Adapt,
 }
 
-named!(Exposure { None = "none", Match = "match" | "gain" | "vignetting" });
+named!(Exposure { None = "none", Match = "match" | "gain" | "vignetting", Adapt = "adapt" });
 
 /// Photometric parameters of all photographs.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,7 +43,7 @@ impl Gains {
     }
 
     /// Returns the maximum gain in stops, 0 or more: the headroom above white.
-    fn headroom_stops(&self) -> f64 {
+    pub(super) fn headroom_stops(&self) -> f64 {
         f64::from(self.gains.iter().flatten().copied().fold(1.0, f32::max).log2())
     }
 
@@ -57,7 +61,13 @@ impl Gains {
 
     /// Builds the tone tables for photographs of `parts` quantization steps per gray level.
     pub(crate) fn tone(&self, parts: usize) -> Tone {
-        Tone::new(&Response { coefficients: self.response }, self.headroom_stops(), parts)
+        self.adapted_tone(None, parts)
+    }
+
+    /// As [`Self::tone`], for the highest radiance after local adaptation.
+    pub(crate) fn adapted_tone(&self, adaptation: Option<&Adaptation>, parts: usize) -> Tone {
+        let highest = adaptation.map_or_else(|| self.headroom_stops(), Adaptation::highest);
+        Tone::new(&Response { coefficients: self.response }, highest, parts)
     }
 }
 
@@ -375,7 +385,8 @@ mod tests {
         let clipped = vec![false; radius.len()];
         let colors = pixels.pixels().flat_map(|p| [p[0], p[1], p[2]]);
         let mean_level = colors.map(f64::from).sum::<f64>() / (3 * radius.len()) as f64;
-        Piece { warped: WarpedPhoto { bounds, pixels }, eccentricity: radius.clone(), radius, clipped, mean_level }
+        let warped = WarpedPhoto { bounds, pixels };
+        Piece { warped, eccentricity: radius.clone(), radius, clipped, mean_level, cost: Vec::new() }
     }
 
     /// Three photographs of 60 x 40, 30 apart, of one scene, their light multiplied by known factors and less toward their corners.
@@ -415,7 +426,7 @@ mod tests {
         let places = (0..2).flat_map(|i| (0..40).flat_map(move |y| (30 * i + 30..30 * i + 60).map(move |x| (i, x, y))));
         let places: Vec<_> = places.filter(|&(i, x, y)| both(preview, i, x, y)).collect();
         assert!(places.len() > 800, "{}", places.len());
-        preview.correct(gains, &[0, 1, 2]);
+        preview.correct(gains, None, &[0, 1, 2]);
         let off = |&(i, x, y): &(usize, usize, usize)| {
             let [a, b] = [i, i + 1].map(|k| preview.pieces[k].warped.color(x, y).unwrap());
             // Levels that are brightened magnify the rounding of dark ones.
@@ -478,7 +489,7 @@ mod tests {
         };
         let before = mean(&set);
         let gains = estimate(&set);
-        set.correct(&gains, &[0, 1, 2]);
+        set.correct(&gains, None, &[0, 1, 2]);
         // Halvings of four stops twelve times: a thousandth of a stop. Rounding does the rest.
         assert!((mean(&set) - before).abs() < 0.3, "{before} {}", mean(&set));
     }
@@ -495,7 +506,7 @@ mod tests {
         };
         let mut set = Preview { step: 1, width: 90, height: 40, pieces: vec![shifted(0), shifted(1)] };
         let gains = estimate_gains(&set, &[0, 1], 2, Exposure::Match, &Silent).unwrap();
-        set.correct(&gains, &[0, 1]);
+        set.correct(&gains, None, &[0, 1]);
         let level = |x: usize| f64::from(set.pieces[usize::from(x >= 60)].warped.color(x, 7).unwrap()[0]);
         let mean = (0..90).map(level).sum::<f64>() / 90.0;
         // Rounding.

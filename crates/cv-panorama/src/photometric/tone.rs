@@ -1,7 +1,8 @@
 //! Tone mapping from levels of a photograph to levels of the panorama: inverse response, exposure correction, then the camera's own response, so that the
 //! panorama looks like the photographs. Radiance above white is compressed instead of clipped.
 
-use crate::photometric::{Gains, Response};
+use crate::photometric::{Adaptation, Gains, Response};
+use cv_core::luma_f32;
 
 /// Table entries per stop.
 const ENTRIES_PER_STOP: f32 = 32.0;
@@ -78,6 +79,12 @@ impl Tone {
         self.log_radiance[i & 2047]
     }
 
+    /// Returns log₂ of the radiance of a level; 0 for white.
+    #[inline(always)]
+    fn stops<const FINE: bool>(&self, level: f32) -> f32 {
+        self.index::<FINE>(level) * (1.0 / ENTRIES_PER_STOP) + MIN_LOG_RADIANCE
+    }
+
     /// Returns the level of the panorama at a fractional index into `levels`.
     #[inline(always)]
     fn level(&self, index: f32) -> f32 {
@@ -106,6 +113,8 @@ pub(crate) struct ExposureCorrection<'a> {
     pub(crate) vignetting: [f32; 2],
     /// Radiance above which a sample is clipped; white is 1. For linear radiance only.
     pub(crate) clipped: f32,
+    /// Local adaptation; not for linear radiance.
+    pub(crate) adaptation: Option<&'a Adaptation>,
 }
 
 impl<'a> ExposureCorrection<'a> {
@@ -113,7 +122,45 @@ impl<'a> ExposureCorrection<'a> {
     pub(crate) fn new(tone: &'a Tone, gains: &Gains, photo: usize) -> Self {
         let gain = gains.gains.get(photo).map_or([0.0; 3], |g| g.map(f32::log2));
         let clipped = gains.clipped();
-        Self { tone, gain, clipped, vignetting: gains.vignetting.map(|v| v * std::f32::consts::LOG2_E) }
+        let vignetting = gains.vignetting.map(|v| v * std::f32::consts::LOG2_E);
+        Self { tone, gain, clipped, vignetting, adaptation: None }
+    }
+
+    /// Returns the correction with local adaptation.
+    pub(crate) fn adapted(self, adaptation: Option<&'a Adaptation>) -> Self {
+        Self { adaptation, ..self }
+    }
+
+    /// Returns log₂ of the corrected radiance of a channel's level, without vignetting correction; 0 for white.
+    pub(crate) fn log_radiance(&self, channel: usize, level: f32) -> f32 {
+        self.tone.stops::<false>(level) + self.gain[channel]
+    }
+
+    /// Returns log₂ of the corrected luminance of a luma level, without vignetting correction; 0 for white.
+    pub(crate) fn log_luminance(&self, luma: f32) -> f32 {
+        self.tone.stops::<false>(luma) + self.mean_gain()
+    }
+
+    #[inline(always)]
+    fn mean_gain(&self) -> f32 {
+        (self.gain[0] + self.gain[1] + self.gain[2]) * (1.0 / 3.0)
+    }
+
+    /// Adds the lifts of local adaptation of a row of canvas pixels from `place` to their vignetting correction; `guides` is a scratch buffer. `FINE`: for 16 bits.
+    #[inline(always)]
+    pub(crate) fn add_adaptation<const FINE: bool>(
+        &self,
+        place: (usize, usize),
+        [r, g, b]: [&[f32]; 3],
+        guides: &mut [f32],
+        lifts: &mut [f32],
+    ) {
+        let Some(adaptation) = self.adaptation else { return };
+        let gain = self.mean_gain();
+        for ((((guide, r), g), b), lift) in guides.iter_mut().zip(r).zip(g).zip(b).zip(&*lifts) {
+            *guide = self.tone.stops::<FINE>(luma_f32([*r, *g, *b])) + (gain + lift);
+        }
+        adaptation.add_row(place, guides, lifts);
     }
 
     /// Returns the vignetting correction, in stops, at a squared distance from the image center.
@@ -157,7 +204,7 @@ mod tests {
     use super::*;
 
     fn correction(tone: &Tone, stops: f32) -> ExposureCorrection<'_> {
-        ExposureCorrection { tone, gain: [stops; 3], vignetting: [0.0; 2], clipped: 1.0 }
+        ExposureCorrection { tone, gain: [stops; 3], vignetting: [0.0; 2], clipped: 1.0, adaptation: None }
     }
 
     #[test]

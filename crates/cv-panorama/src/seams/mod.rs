@@ -146,7 +146,8 @@ fn voronoi(preview: &Preview) -> Image<u16, 1> {
 fn data_term(piece: &Piece, clipped: f32, x: usize, y: usize) -> f32 {
     let b = piece.warped.bounds;
     let i = (y - b.top) * b.width() + x - b.left;
-    ECCENTRICITY_COST * piece.eccentricity[i] + if piece.clipped[i] { clipped } else { 0.0 }
+    let own = piece.cost.get(i).copied().unwrap_or(0.0);
+    ECCENTRICITY_COST * piece.eccentricity[i] + if piece.clipped[i] { clipped } else { 0.0 } + own
 }
 
 /// Returns the cost of [`transient_costs`] of a pixel, 0 without them.
@@ -360,6 +361,7 @@ mod tests {
                 clipped: vec![false; eccentricity.len()],
                 eccentricity,
                 mean_level: 0.0,
+                cost: Vec::new(),
             }
         };
         Preview { step: 1, width: SIZE.0, height: SIZE.1, pieces: vec![piece(0, 120, 70), piece(40, 160, 82)] }

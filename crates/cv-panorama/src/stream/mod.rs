@@ -15,8 +15,9 @@ pub(crate) use scratch::WarpedStore;
 use crate::align::Alignment;
 use crate::bit_depth::PhotoSample;
 use crate::blend::NO_PHOTO;
+use crate::brackets;
 use crate::masks::{Filled, PhotoMask, PlacedMasks};
-use crate::photometric::{Exposure, Gains, estimate_gains};
+use crate::photometric::{Adaptation, Exposure, Gains, estimate_gains};
 use crate::regions::regions;
 use crate::render::{CompositingOptions, Drawing, PREVIEW_PIXELS, Panorama, RenderError, check, draw};
 use crate::seams::{self, Seams};
@@ -253,11 +254,15 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     masked.remove(&mut preview);
     clock.lap("preview");
     let gains = estimate_gains(&preview, &photo_of, alignment.views.len(), options.exposure, progress)?;
+    let adaptation = Adaptation::new(&preview, &gains, &photo_of, options.exposure, &layout, progress)?;
+    let stacks = brackets::stacks(alignment, &gains);
+    let lumas = brackets::lumas(&preview, &stacks, &photo_of);
     if options.exposure != Exposure::None {
-        preview.correct(&gains, &photo_of);
+        preview.correct(&gains, adaptation.as_ref(), &photo_of);
     }
     masked.keep(&mut preview);
     drop(masked);
+    brackets::set_costs(&mut preview, &stacks, &photo_of, &lumas, &Stage::new(progress, "exposure", 1)?)?;
     clock.lap("exposure");
     let coarse =
         seams::on_preview(&preview, &photo_of, options.seams, options.radiance, options.removes_transients, progress)?;
@@ -266,7 +271,14 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     drop(preview);
     clock.lap("seams");
 
-    let drawing = Drawing { layout: &layout, regions: &regions, fields: &fields, options, masks: &placed };
+    let drawing = Drawing {
+        layout: &layout,
+        regions: &regions,
+        fields: &fields,
+        options,
+        adaptation: adaptation.as_ref(),
+        masks: &placed,
+    };
     let warped = warped(photos, &drawing, &gains, &scratch, progress)?;
     clock.lap("warp");
     let mut labels = LabelRows::new(canvas.0);
@@ -316,6 +328,7 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
         full_circle: layout.full_circle && shown.width() == canvas.0,
         reaches_beyond: layout.reaches_beyond,
         gains,
+        stacks,
         stages: clock.into_stages(),
     };
     panorama.map.crop(shown.left, shown.top);
@@ -451,7 +464,7 @@ fn warped<'s, T: PhotoSample>(
 ) -> Result<WarpedStore<'s, T>, RenderError> {
     let placements = &drawing.layout.placements;
     let stage = Stage::new(progress, "warp", placements.len())?;
-    let tone = gains.tone(T::PARTS);
+    let tone = gains.adapted_tone(drawing.adaptation, T::PARTS);
     let mut store = WarpedStore::new(scratch);
     let load = |k: usize| -> Result<Option<Cow<'_, Image<T, 3>>>, StreamError> {
         let needed = placements.get(k).filter(|_| drawing.regions[k].is_some());

@@ -141,6 +141,26 @@ fn sixteen_bits_and_reduced_resolution_are_the_same_as_the_whole() {
     compare(Loaded(deep), &CompositingOptions { resolution: 0.4, ..options }, 1);
 }
 
+#[test]
+fn locally_adapted_panoramas_are_the_same_as_the_whole() {
+    // Levels by 0.7 from one to the next: about a stop.
+    let dark = |i: usize| move |ray: &Vector3<f64>| scene(i)(ray).map(|v| v * 0.7_f64.powi(i as i32));
+    let views: Vec<View> = alignment().views.into_iter().map(Result::unwrap).collect();
+    let bytes: Vec<_> = views.iter().enumerate().map(|(i, view)| photograph(view, dark(i))).collect();
+    let deep: Vec<_> = views.iter().enumerate().map(|(i, view)| deep_photograph(view, dark(i))).collect();
+    for resolution in [3.0, 0.4] {
+        let options = CompositingOptions { resolution, exposure: Exposure::Adapt, ..CompositingOptions::default() };
+        let strips = if resolution > 1.0 { 2 } else { 1 };
+        compare(Loaded(bytes.clone()), &options, strips);
+        compare(Loaded(deep.clone()), &options, strips);
+        // It is not the other method's.
+        let photos: Vec<_> = bytes.iter().map(Image::view).collect();
+        let matched = CompositingOptions { exposure: Exposure::Match, ..options };
+        let [a, b] = [options, matched].map(|o| render(&photos, &alignment(), &o, &cv_core::Silent).unwrap().image);
+        assert!(a != b);
+    }
+}
+
 /// A preview pixel is more than four canvas pixels there: seams are refined by blocks first.
 #[test]
 fn seams_of_large_canvases_are_the_same_as_the_whole() {

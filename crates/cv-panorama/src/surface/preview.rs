@@ -1,10 +1,10 @@
 //! The canvas at reduced resolution, on which exposure compensation and seam finding run.
 
 use crate::align::View;
-use crate::photometric::{ExposureCorrection, Gains, SATURATED_LEVEL};
+use crate::photometric::{Adaptation, ExposureCorrection, Gains, SATURATED_LEVEL};
 use crate::rows::is_check_due;
 use crate::surface::{Bounds, DisplacementField, Layout, Map, Placement, Surface, WarpSettings, WarpedPhoto, warp};
-use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Scaling, Stage};
+use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Scaling, Stage, luma_f32};
 use cv_imgproc::Interpolation;
 use rayon::prelude::*;
 
@@ -29,6 +29,8 @@ pub(crate) struct Piece {
     pub(crate) clipped: Vec<bool>,
     /// Mean level of the photograph's samples.
     pub(crate) mean_level: f64,
+    /// Data term of the seams at each pixel, for photographs of exposure brackets; empty for none.
+    pub(crate) cost: Vec<f32>,
 }
 
 impl Piece {
@@ -49,6 +51,14 @@ impl Piece {
             let places = (0..height).flat_map(|y| (0..width).map(move |x| corner(x, y)));
             places.map(|(x, y)| values[y * b.width() + x]).collect()
         };
+        let greatest = |values: &[f32]| {
+            let places = (0..height).flat_map(|y| (0..width).map(move |x| corner(x, y)));
+            let greatest = |(x, y): (usize, usize)| {
+                let four = [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)];
+                four.iter().map(|(x, y)| values[y * b.width() + x]).fold(0.0, f32::max)
+            };
+            places.map(greatest).collect()
+        };
         let clipped = (0..width * height).map(|i| {
             let (x, y) = corner(i % width, i / width);
             [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)].iter().any(|(x, y)| self.clipped[y * b.width() + x])
@@ -59,6 +69,7 @@ impl Piece {
             radius: at_corners(&self.radius),
             clipped: clipped.collect(),
             mean_level: self.mean_level,
+            cost: if self.cost.is_empty() { Vec::new() } else { greatest(&self.cost) },
         }
     }
 }
@@ -140,7 +151,7 @@ impl Preview {
             let clipped = pixels.map(|p| p[..3].iter().any(|v| *v >= SATURATED_LEVEL)).collect();
             let samples = photo.as_slice();
             let mean_level = samples.iter().map(|v| u64::from(*v)).sum::<u64>() as f64 / samples.len().max(1) as f64;
-            Ok(Some(Piece { warped, eccentricity, radius, clipped, mean_level }))
+            Ok(Some(Piece { warped, eccentricity, radius, clipped, mean_level, cost: Vec::new() }))
         };
         let pieces: Vec<Option<Piece>> =
             layout.placements.par_iter().enumerate().map(draw).collect::<Result<_, Cancelled>>()?;
@@ -148,13 +159,19 @@ impl Preview {
     }
 
     /// Applies the exposure correction to every piece.
-    pub(crate) fn correct(&mut self, gains: &Gains, photo_of: &[usize]) {
-        let tone = gains.tone(1);
+    pub(crate) fn correct(&mut self, gains: &Gains, adaptation: Option<&Adaptation>, photo_of: &[usize]) {
+        let tone = gains.adapted_tone(adaptation, 1);
         self.pieces.par_iter_mut().zip(photo_of).for_each(|(piece, &photo)| {
             let correction = ExposureCorrection::new(&tone, gains, photo);
+            let b = piece.warped.bounds;
             let pixels = piece.warped.pixels.as_mut_slice().as_chunks_mut::<4>().0;
-            for (p, r2) in pixels.iter_mut().zip(&piece.radius) {
-                let color = correction.levels([p[0], p[1], p[2]].map(f32::from), correction.vignetting_stops(*r2));
+            for (i, (p, r2)) in pixels.iter_mut().zip(&piece.radius).enumerate() {
+                let (levels, mut lift) = ([p[0], p[1], p[2]].map(f32::from), correction.vignetting_stops(*r2));
+                if let Some(adaptation) = adaptation {
+                    let guide = correction.log_luminance(luma_f32(levels)) + lift;
+                    lift += adaptation.at_preview(b.left + i % b.width(), b.top + i / b.width(), guide);
+                }
+                let color = correction.levels(levels, lift);
                 let [r, g, b] = color.map(|v| (v + 0.5) as u8);
                 *p = [r, g, b, p[3]];
             }
@@ -284,6 +301,7 @@ mod tests {
             radius: numbered,
             clipped: (0..35).map(|i| i == 8).collect(),
             mean_level: 0.0,
+            cost: Vec::new(),
         };
         let half = piece.halved();
         assert_eq!(half.warped.bounds, Bounds { left: 2, top: 1, right: 5, bottom: 3 });
@@ -306,6 +324,7 @@ mod tests {
             radius: vec![0.0],
             clipped: vec![false],
             mean_level: 9.0,
+            cost: Vec::new(),
         }
         .halved();
         assert!(half.warped.pixels.is_empty() && half.radius.is_empty());

@@ -90,15 +90,16 @@ pub(crate) fn warp<T: Channel>(
             }
             let (before, rest) = row.split_at_mut(4 * first);
             let (row, after) = rest.split_at_mut(4 * (end - first));
+            let place = (span.start, bounds.top + y);
             match settings.interpolation {
                 Interpolation::Nearest => {
-                    dispatch!(level, simd => sample_row::<_, _, Nearest>(simd, photo, buffer, row, correction))
+                    dispatch!(level, simd => sample_row::<_, _, Nearest>(simd, photo, buffer, row, place, correction))
                 }
                 Interpolation::Bilinear => {
-                    dispatch!(level, simd => sample_row::<_, _, Bilinear>(simd, photo, buffer, row, correction))
+                    dispatch!(level, simd => sample_row::<_, _, Bilinear>(simd, photo, buffer, row, place, correction))
                 }
                 Interpolation::Bicubic => {
-                    dispatch!(level, simd => sample_row::<_, _, Bicubic>(simd, photo, buffer, row, correction))
+                    dispatch!(level, simd => sample_row::<_, _, Bicubic>(simd, photo, buffer, row, place, correction))
                 }
             }
             let sampled = row.as_chunks::<4>().0;
@@ -232,7 +233,7 @@ impl Row {
     }
 }
 
-/// Samples one row; coordinates outside the photograph are clamped to its border and get opacity 0. One loop per step, so that all but the lookups are
+/// Samples one row of canvas pixels from `place`; coordinates outside the photograph are clamped to its border and get opacity 0. One loop per step, so that all but the lookups are
 /// vectorized.
 #[inline(always)]
 fn sample_row<S: Simd, T: Channel, I: Sampler>(
@@ -240,6 +241,7 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
     photo: ImageView<'_, T, 3>,
     buffer: &mut Row,
     row: &mut [T],
+    place: (usize, usize),
     correction: Option<ExposureCorrection<'_>>,
 ) {
     let n = row.len() / 4;
@@ -282,8 +284,10 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
                     (r.max(0.0) * factors[0] * lift, g.max(0.0) * factors[1] * lift, b.max(0.0) * factors[2] * lift);
             }
         } else if T::PARTS == 1 {
+            correction.add_adaptation::<false>(place, [&*reds, &*greens, &*blues], clipped, lifts);
             correction.row_of_levels::<false>([&mut reds[..], &mut greens[..], &mut blues[..]], lifts, clipped);
         } else {
+            correction.add_adaptation::<true>(place, [&*reds, &*greens, &*blues], clipped, lifts);
             correction.row_of_levels::<true>([&mut reds[..], &mut greens[..], &mut blues[..]], lifts, clipped);
         }
         scale([&mut *reds, &mut *greens, &mut *blues], T::PER_LEVEL);

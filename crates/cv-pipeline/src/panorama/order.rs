@@ -67,11 +67,16 @@ impl Order {
         let features = if result.features.is_empty() { Vec::new() } else { self.restored(result.features) };
         let mut pairs: Vec<PanoramaPair> = result.pairs.into_iter().map(|pair| self.restored_pair(pair)).collect();
         pairs.sort_by_key(|pair| (pair.a, pair.b));
+        let mut stacks: Vec<Vec<usize>> =
+            result.stacks.iter().map(|stack| stack.iter().map(|&k| self.inputs[k]).collect()).collect();
+        stacks.iter_mut().for_each(|stack| stack.sort_unstable());
+        stacks.sort_unstable();
         PanoramaResult {
             labels,
             map,
             features,
             pairs,
+            stacks,
             images: self.restored_images(result.images),
             alignment: renumbered(result.alignment, &self.inputs),
             ..result
