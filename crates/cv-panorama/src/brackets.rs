@@ -2,7 +2,8 @@
 //!
 //! Recognized by the alignment and the estimated exposures, as Hugin does by the overlap and EXIF. Merging needs no stage of its own: after exposure compensation the photographs of a stack are alternatives of
 //! equal tone, and the seams select among them, as among neighbors (Agarwala et al. 2004, "Interactive digital photomontage"). A data term prefers the best exposed photograph of the stack, and others only
-//! where it is clipped or in the noise. As the smoothness term keeps seams out of differences, what moves between exposures comes from one photograph: it is whole or absent.
+//! where it is clipped or in the noise. As the smoothness term keeps seams out of differences, and the data term has no preference where photographs differ beyond noise, what moves between exposures comes from one
+//! photograph: it is whole or absent where a seam can pass around it.
 
 use crate::align::{Alignment, View};
 use crate::photometric::{Gains, mean_stops, well_exposed};

@@ -111,7 +111,7 @@ fn brackets_are_stacks_of_which_nothing_is_clipped_or_cut() {
         for (k, (all, part)) in parts.iter().enumerate() {
             // A seam along an outline passes within its pixels, of which there are some 3 %.
             let share = *part as f64 / *all as f64;
-            assert!(*all > 500 && (share < 0.03 || share > 0.97), "{blend:?}: person {k} {share} of {all}");
+            assert!(*all > 500 && !(0.03..=0.97).contains(&share), "{blend:?}: person {k} {share} of {all}");
         }
     }
 }
