@@ -36,6 +36,7 @@ mod align;
 mod bit_depth;
 mod blend;
 mod brackets;
+mod compensation;
 mod masks;
 mod photometric;
 mod regions;

@@ -3,11 +3,10 @@
 use crate::align::Alignment;
 use crate::bit_depth::{Channel, EightBits, PhotoSample};
 use crate::blend::{BlendMode, Blender, Composition, NO_PHOTO, of_mode};
-use crate::brackets;
+use crate::compensation::Compensation;
 use crate::masks::{PhotoMask, PlacedMasks, filled};
 use crate::photometric::{
-    Adaptation, Exposure, ExposureCorrection, Gains, Tone, decode_radiance, estimate_gains, fill_saturated,
-    relative_gains,
+    Adaptation, Exposure, ExposureCorrection, Gains, Tone, decode_radiance, fill_saturated, relative_gains,
 };
 use crate::regions::{Region, regions};
 use crate::rows::for_each_row;
@@ -241,15 +240,9 @@ pub(crate) fn draw<T: PhotoSample>(
     let masked = placed.on_preview(&preview, scale, progress)?;
     masked.remove(&mut preview);
     clock.lap("preview");
-    let gains = estimate_gains(&preview, &photo_of, photos.len(), options.exposure, progress)?;
-    let adaptation = Adaptation::new(&preview, &gains, &photo_of, options.exposure, &layout, progress)?;
-    let stacks = brackets::stacks(alignment, &gains);
-    let lumas = brackets::lumas(&preview, &stacks, &photo_of);
-    if options.exposure != Exposure::None {
-        preview.correct(&gains, adaptation.as_ref(), &photo_of);
-    }
-    masked.keep(&mut preview);
-    brackets::set_costs(&mut preview, &stacks, &photo_of, &lumas, &Stage::new(progress, "exposure", 1)?)?;
+    let Compensation { gains, adaptation, stacks } =
+        Compensation::apply(&mut preview, &masked, (photos.len(), alignment), &layout, options.exposure, progress)?;
+    drop(masked);
     clock.lap("exposure");
     let coarse =
         seams::on_preview(&preview, &photo_of, options.seams, options.radiance, options.removes_transients, progress)?;

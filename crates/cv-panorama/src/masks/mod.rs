@@ -8,7 +8,7 @@ mod fill;
 mod placed;
 
 pub(crate) use fill::{Filled, filled};
-pub(crate) use placed::{PlacedMasks, is_removed, is_removed_near};
+pub(crate) use placed::{PlacedMasks, PreviewMasks, is_removed, is_removed_near};
 
 use cv_core::Image;
 

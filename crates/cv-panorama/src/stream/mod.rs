@@ -15,9 +15,9 @@ pub(crate) use scratch::WarpedStore;
 use crate::align::Alignment;
 use crate::bit_depth::PhotoSample;
 use crate::blend::NO_PHOTO;
-use crate::brackets;
+use crate::compensation::Compensation;
 use crate::masks::{Filled, PhotoMask, PlacedMasks};
-use crate::photometric::{Adaptation, Exposure, Gains, estimate_gains};
+use crate::photometric::Gains;
 use crate::regions::regions;
 use crate::render::{CompositingOptions, Drawing, PREVIEW_PIXELS, Panorama, RenderError, check, draw};
 use crate::seams::{self, Seams};
@@ -253,16 +253,15 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     let masked = placed.on_preview(&preview, scale, progress)?;
     masked.remove(&mut preview);
     clock.lap("preview");
-    let gains = estimate_gains(&preview, &photo_of, alignment.views.len(), options.exposure, progress)?;
-    let adaptation = Adaptation::new(&preview, &gains, &photo_of, options.exposure, &layout, progress)?;
-    let stacks = brackets::stacks(alignment, &gains);
-    let lumas = brackets::lumas(&preview, &stacks, &photo_of);
-    if options.exposure != Exposure::None {
-        preview.correct(&gains, adaptation.as_ref(), &photo_of);
-    }
-    masked.keep(&mut preview);
+    let Compensation { gains, adaptation, stacks } = Compensation::apply(
+        &mut preview,
+        &masked,
+        (alignment.views.len(), alignment),
+        &layout,
+        options.exposure,
+        progress,
+    )?;
     drop(masked);
-    brackets::set_costs(&mut preview, &stacks, &photo_of, &lumas, &Stage::new(progress, "exposure", 1)?)?;
     clock.lap("exposure");
     let coarse =
         seams::on_preview(&preview, &photo_of, options.seams, options.radiance, options.removes_transients, progress)?;

@@ -1,6 +1,7 @@
 use super::*;
 use crate::align::{CameraMotion, View};
 use crate::blend::BlendMode;
+use crate::photometric::Exposure;
 use crate::render::render;
 use crate::testing::{StopAt, deep_photograph, photograph, sky};
 use cv_core::{Camera, Cancelled, Vector3};
