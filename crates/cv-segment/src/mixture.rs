@@ -2,8 +2,8 @@
 
 use cv_core::{Cancelled, Progress, Stage};
 use nalgebra::{Matrix3, Vector3};
-use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -321,10 +321,15 @@ fn initial_components(
     Ok(maximization(&clusters, total, variance_floor))
 }
 
+/// Draws a number uniformly from [0, 1), of 53 random bits.
+fn uniform(rng: &mut impl Rng) -> f64 {
+    (rng.next_u64() >> 11) as f64 / (1u64 << 53) as f64
+}
+
 /// Draws an index with the given unnormalized probabilities; `None` where all are zero.
 fn draw<I: Iterator<Item = f64>>(probabilities: impl Fn() -> I, rng: &mut impl Rng) -> Option<usize> {
     let total: f64 = probabilities().sum();
-    let mut remaining = rng.random::<f64>() * total;
+    let mut remaining = uniform(rng) * total;
     let mut last = None;
     for (i, probability) in probabilities().enumerate() {
         if probability > 0.0 {
@@ -397,7 +402,7 @@ mod tests {
     /// twelve uniform variates).
     fn gaussian_samples(n: usize, mean: [f64; 3], deviation: [f64; 3], seed: u64) -> Vec<WeightedSample> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut normal = || (0..12).map(|_| rng.random::<f64>()).sum::<f64>() - 6.0;
+        let mut normal = || (0..12).map(|_| uniform(&mut rng)).sum::<f64>() - 6.0;
         (0..n)
             .map(|_| WeightedSample { point: std::array::from_fn(|i| mean[i] + deviation[i] * normal()), weight: 1.0 })
             .collect()

@@ -42,6 +42,14 @@ impl Rendered {
         let p = Point3::new(ray.x * z, ray.y * z, z);
         (z > 0.0).then(|| self.pose.inverse().transform(&p))
     }
+
+    /// Returns another photograph of the same view, without rendering it again: exposed longer by `stops`, with the noise of
+    /// `options` (its other fields have no effect).
+    pub fn retake(&self, stops: f32, options: &RenderOptions) -> Self {
+        let gain = stops.exp2();
+        let linear = self.linear.map(|color| color.map(|c| c * gain));
+        Self { image: sensor::develop(&linear, options), linear, ..self.clone() }
+    }
 }
 
 /// Renders a view of a scene.

@@ -34,6 +34,12 @@ impl StereoPair {
             [!self.visible.at(x, y)[0] && self.disparity.at(x, y)[0].is_finite()]
         })
     }
+
+    /// Returns another pair of photographs of the same views (see [`Rendered::retake`]).
+    pub fn retake(&self, stops: f32, options: &RenderOptions) -> Self {
+        let (left, right) = (self.left.retake(stops, options), self.right.retake(stops, &right_options(options)));
+        Self { left, right, ..self.clone() }
+    }
 }
 
 /// Renders a rectified pair; `pose` is that of the left camera.
@@ -52,10 +58,15 @@ pub fn stereo_pair(
     }
     let right_pose = Pose::new(pose.rotation, pose.translation - Vector3::new(baseline, 0.0, 0.0));
     let left = render(scene, camera, pose, options)?;
-    let right = render(scene, camera, &right_pose, &options.clone().with_seed(options.seed ^ 0x5117))?;
+    let right = render(scene, camera, &right_pose, &right_options(options))?;
     let disparity = |view: &Rendered| view.depth.map(|[z]| [(camera.fx * baseline / f64::from(z)) as f32]);
     let visible = scene.visible_in_both(&left, &right);
     Ok(StereoPair { disparity: disparity(&left), disparity_right: disparity(&right), left, right, baseline, visible })
+}
+
+/// Returns the options of the right image of a pair: its noise is its own.
+fn right_options(options: &RenderOptions) -> RenderOptions {
+    options.clone().with_seed(options.seed ^ 0x5117)
 }
 
 /// Two views of a plane.

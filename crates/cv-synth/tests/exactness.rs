@@ -339,3 +339,15 @@ fn an_image_does_not_depend_on_earlier_images() {
         assert_eq!((a.image.as_slice(), a.linear.as_slice()), (b.image.as_slice(), b.linear.as_slice()));
     }
 }
+
+#[test]
+fn a_retaken_pair_is_the_one_rendered_at_that_exposure() {
+    let (scene, options) = (Scene::room(2), RenderOptions::default());
+    let pair = stereo_pair(&scene, &camera(), &scene.viewpoint(), 0.2, &options).unwrap();
+    // Powers of two: gains are exact.
+    let other = RenderOptions { exposure: -1.0, seed: 7, full_well: 3000.0, ..options };
+    let (again, expected) =
+        (pair.retake(-1.0, &other), stereo_pair(&scene, &camera(), &scene.viewpoint(), 0.2, &other).unwrap());
+    assert!(again.left.image == expected.left.image && again.right.image == expected.right.image);
+    assert!(again.left.linear == expected.left.linear && again.left.image != pair.left.image);
+}

@@ -26,13 +26,10 @@ fn the_warning_is_given_where_filled_pixels_are_often_wrong() {
     let mut warned = 0;
     for seed in [501, 503] {
         for (scene, baseline) in [(Scene::room(seed), 0.2), (Scene::tabletop(seed), 0.06)] {
+            let bright = stereo_pair(&scene, &camera, &scene.viewpoint(), baseline, &light).unwrap();
+            let noisy = RenderOptions { full_well: 300.0, ..light.clone() };
             // As usual, underexposed by four stops, and with a sensor of 300 electrons.
-            for options in [
-                light.clone(),
-                RenderOptions { exposure: -4.0, ..light.clone() },
-                RenderOptions { full_well: 300.0, ..light.clone() },
-            ] {
-                let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), baseline, &options).unwrap();
+            for pair in [bright.clone(), bright.retake(-4.0, &light), bright.retake(0.0, &noisy)] {
                 let stereo = StereoOptions { disparities: 64, ..StereoOptions::default() };
                 let options = DepthOptions { stereo, ..DepthOptions::default() };
                 let found = depth(pair.left.image.view(), pair.right.image.view(), None, &options, &Silent).unwrap();

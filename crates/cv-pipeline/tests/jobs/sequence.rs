@@ -31,9 +31,10 @@ fn object_columns(frame: usize) -> std::ops::Range<usize> {
 fn frames(seed: u64) -> Vec<Frame> {
     let scene = Scene::room(seed);
     let camera = Camera::from_focal(SIZE.0, SIZE.1, 260.0);
+    let bright = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.2, &RenderOptions::default()).unwrap();
     let frame = |t: usize| {
-        let noise = RenderOptions { exposure: -1.0, full_well: 3000.0, seed: 500 + t as u64, ..Default::default() };
-        let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.2, &noise).unwrap();
+        let noise = RenderOptions { full_well: 3000.0, seed: 500 + t as u64, ..Default::default() };
+        let pair = bright.retake(-1.0, &noise);
         let (mut left, mut right, mut truth) = (pair.left.image, pair.right.image, pair.disparity.clone());
         let mut visible = pair.visible.as_slice().to_vec();
         let hash = |x: usize, y: usize| ((x * 7919 + y * 104_729) as u32).wrapping_mul(2_654_435_761).rotate_left(9);

@@ -37,11 +37,10 @@ struct RenderedScene {
 /// all tests.
 static SCENES: LazyLock<Vec<RenderedScene>> = LazyLock::new(|| {
     let seen = |name: String, scene: Scene, baseline: f64| {
-        let pair =
-            |options: &RenderOptions| stereo_pair(&scene, &camera(), &scene.viewpoint(), baseline, options).unwrap();
         let options = RenderOptions::default();
-        let dark = RenderOptions { exposure: -1.0, ..options.clone().with_seed(99) };
-        RenderedScene { name, baseline, pair: pair(&options), darker: pair(&dark) }
+        let pair = stereo_pair(&scene, &camera(), &scene.viewpoint(), baseline, &options).unwrap();
+        let darker = pair.retake(-1.0, &options.with_seed(99));
+        RenderedScene { name, baseline, pair, darker }
     };
     SEEDS
         .flat_map(|seed| {

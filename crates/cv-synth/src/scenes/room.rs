@@ -14,7 +14,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 const ROOM_SIZE: [f64; 3] = [6.0, 2.7, 9.0];
 
 /// Number of cached rooms, some megabytes each.
-const CACHED_ROOMS: usize = 8;
+const CACHED_ROOMS: usize = 16;
 
 /// Returns the cache of the most recent rooms, by seed.
 fn room_cache() -> MutexGuard<'static, VecDeque<(u64, Scene)>> {

@@ -1,9 +1,6 @@
 //! Reports in a browser: headless Chromium opens one of each kind, light and dark, at the width of a phone and of a screen.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{done, fixture, run};
 use cv_core::{Camera, GrayF32};
 use serde_json::Value;
 use std::{
@@ -15,7 +12,6 @@ use std::{
     sync::mpsc::{Sender, channel},
     time::Duration,
 };
-use support::{done, fixture, run};
 
 /// Widths of a phone and of a screen, in CSS pixels.
 const WIDTHS: [u32; 2] = [420, 1400];

@@ -1,13 +1,9 @@
 //! Degenerate sets of photographs for `cv calibrate` and malformed calibration files, as a black box: each is refused for its own reason, and nothing is written.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{done, json, refused};
 use cv_core::GrayU8;
 use std::fs;
 use std::path::Path;
-use support::{done, json, refused};
 
 /// Options of the marker board of most tests.
 const BOARD: [&str; 8] = ["--kind", "aruco-grid", "--board", "3x2", "--marker", "30", "--dictionary", "4x4_50"];

@@ -1,13 +1,9 @@
 //! `cv reconstruct` as a black box.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{fixture, json, refused, run};
 use cv_core::{Camera, Pose, RgbU8, Vector3};
 use cv_synth::{RenderOptions, Scene, render};
 use std::{fs, path::Path};
-use support::{fixture, json, refused, run};
 
 /// Returns the number of points in the header of a PLY file.
 fn points(path: &Path) -> u64 {

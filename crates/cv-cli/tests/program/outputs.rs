@@ -1,11 +1,7 @@
 //! Outputs of commands: complete or not written at all, the same with any number of threads, and no other files.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{JOBS, cv, done, json, refused, run, snapshot, strs};
 use std::{fs, process::Stdio, time::Instant};
-use support::{JOBS, cv, done, json, refused, run, snapshot, strs};
 
 #[test]
 fn json_is_one_object_and_stdout_is_empty_without_it() {

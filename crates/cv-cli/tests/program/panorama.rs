@@ -1,14 +1,10 @@
 //! `cv panorama` as a black box: the effect of its options.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{done, fixture, json, refused, run, strs};
 use cv_core::{Camera, RgbU8, Vector3};
 use cv_synth::{Vista, VistaOptions, vista_photos, vista_response};
 use std::f64::consts::PI;
 use std::path::Path;
-use support::{done, fixture, json, refused, run, strs};
 
 #[test]
 fn alpha_is_transparent_where_no_photograph_reaches() {

@@ -1,11 +1,7 @@
 //! `cv estimate` as a black box: the three models, and degenerate matches.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{json, refused, run};
 use std::{fs, path::Path};
-use support::{json, refused, run};
 
 /// Returns matches of a camera with a focal length of 800 px that moves to the right and rotates by 0.1 rad about the vertical; every fifth is an outlier.
 fn two_views(flat: bool) -> Vec<[f64; 4]> {

@@ -1,9 +1,6 @@
 //! `cv sfm` as a black box, on rendered walks with known poses.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{cv, json, refused, run, snapshot, strs};
 use cv_core::{Camera, Point3, Pose, RgbU8, SparseModel, Vector3};
 use cv_io::{Metadata, colmap};
 use cv_synth::{RenderOptions, Scene, direction_error, render, rotation_error};
@@ -11,7 +8,6 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::process::Stdio;
 use std::{fs, path::Path, thread::sleep, time::Duration};
-use support::{cv, json, refused, run, snapshot, strs};
 
 const CAMERA: [usize; 2] = [400, 300];
 const FOCAL: f64 = 330.0;

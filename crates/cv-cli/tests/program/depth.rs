@@ -1,13 +1,9 @@
 //! `cv depth` and `cv eval disparity` as a black box.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{done, json, refused, run};
 use cv_core::{Camera, Image, RgbU8};
 use cv_synth::{RenderOptions, Scene, StereoPair, stereo_pair};
 use std::sync::LazyLock;
-use support::{done, json, refused, run};
 
 /// A small generated pair with ground truth.
 static PAIR: LazyLock<StereoPair> = LazyLock::new(|| {
@@ -464,7 +460,7 @@ fn peak_of_frames(frames: usize, more: &[&str]) -> f64 {
         }
     }
     std::fs::create_dir(folder.path().join("out")).unwrap();
-    let mut child = support::cv(folder.path())
+    let mut child = crate::support::cv(folder.path())
         .args(["depth", "left", "right", "-o", "out", "--quiet", "--threads", "2"])
         .args(more)
         .spawn()

@@ -1,15 +1,11 @@
 //! The guides under `docs/` and the README: their commands run, commands with a stated failure fail with that message, and their links are valid.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::done;
 use std::{
     fs,
     path::{Path, PathBuf},
     process::{Command, Stdio},
 };
-use support::done;
 
 /// The pages in the order of their execution: each may use the files of earlier ones.
 const GUIDES: [&str; 12] = [

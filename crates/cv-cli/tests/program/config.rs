@@ -1,11 +1,7 @@
 //! Options from a configuration file.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{done, run};
 use std::{fs, path::Path};
-use support::{done, run};
 
 /// Writes matches with a common translation.
 fn folder() -> tempfile::TempDir {

@@ -1,13 +1,9 @@
 //! Damaged inputs to the program, a few of each kind; `cargo xtask trust corrupt` does ten thousand.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{done, fixture, run, snapshot};
 use cv_core::{GrayF32, RgbU8};
 use cv_synth::corrupt;
 use std::fs;
-use support::{done, fixture, run, snapshot};
 
 /// Number of damaged versions of each file.
 const RUNS: u64 = 8;

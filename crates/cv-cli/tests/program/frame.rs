@@ -1,10 +1,6 @@
 //! Behavior common to all commands, as a black box: usage, help, exit codes, stdout and stderr.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
-use support::{cv, done, json, refused, run};
+use crate::support::{cv, done, json, refused, run};
 
 /// Returns the names in the list of commands.
 fn commands() -> Vec<String> {

@@ -1,11 +1,7 @@
 //! Input photographs as files, folders and patterns, in every command.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{JOBS, done, fixture, run, strs};
 use std::fs;
-use support::{JOBS, done, fixture, run, strs};
 
 #[test]
 fn every_command_expands_folders_and_patterns() {

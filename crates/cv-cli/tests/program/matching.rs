@@ -1,15 +1,11 @@
 //! `cv match` as a black box: every kind of features against the known geometry of generated pairs, guided matching, and saved features.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{done, fixture, json, refused, run};
 use cv_core::{Matrix3, Vector3};
 use std::{
     fs,
     path::{Path, PathBuf},
 };
-use support::{done, fixture, json, refused, run};
 
 /// Creates a folder with the two images of a fixture as `a.jpg` and `b.jpg`; also returns its ground truth.
 fn pair(name: &str) -> (tempfile::TempDir, serde_json::Value) {

@@ -1,13 +1,9 @@
 //! `cv rectify` as a black box.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{done, json, refused, run, snapshot};
 use cv_core::{Camera, Pose, Rotation3, StereoRig, Vector3};
 use cv_io::RigFile;
 use cv_synth::{RenderOptions, Scene, render};
-use support::{done, json, refused, run, snapshot};
 
 /// Renders two photographs of a room by a rig with a second camera rotated by about a degree, and writes the rig's file.
 fn rig(vertical: bool) -> tempfile::TempDir {

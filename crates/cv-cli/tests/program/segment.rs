@@ -1,12 +1,8 @@
 //! `cv segment` as a black box.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{done, json, refused, run};
 use cv_core::{Mask, RgbU8};
 use std::fs;
-use support::{done, json, refused, run};
 
 /// Writes four images of an orange disc on gray and their masks to a new folder.
 fn discs() -> tempfile::TempDir {

@@ -2,10 +2,7 @@
 //! remains. (Killed runs: `outputs.rs`, and 200 of them in `cargo xtask trust killed`.)
 
 #![cfg(target_os = "linux")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{Ran, cv, done, fixture, refused, snapshot, strs};
 use cv_core::{GrayU8, RgbU8};
 use std::{
     fs,
@@ -13,7 +10,6 @@ use std::{
     path::Path,
     process::{Command, Stdio},
 };
-use support::{Ran, cv, done, fixture, refused, snapshot, strs};
 
 /// Commands that take some ten milliseconds: arguments and outputs.
 type Job = (&'static str, &'static [&'static str]);

@@ -1,12 +1,10 @@
 //! Every command that reads images, with valid, unusual and broken files.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{
+    JOBS, done, odd_name, refused, run, snapshot, strs, write_broken, write_cmyk, write_lossless_variants,
+};
 use cv_core::{GrayU8, Image, RgbU8};
 use std::fs;
-use support::{JOBS, done, odd_name, refused, run, snapshot, strs, write_broken, write_cmyk, write_lossless_variants};
 
 #[test]
 fn a_file_that_is_not_an_image_is_refused_by_name() {
@@ -205,7 +203,7 @@ fn photographs_are_read_once() {
             // The thread ends when all has been read; a second open of the pipe would block forever.
             std::thread::spawn(move || fs::write(path, bytes));
         }
-        let mut command = support::cv(folder.path());
+        let mut command = crate::support::cv(folder.path());
         let mut child = command.args(job.args(&inputs)).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         let start = Instant::now();
         // Far longer than a job on small images takes on a busy machine.

@@ -1,13 +1,9 @@
 //! Bit depth, EXIF and color profiles from input to output.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on has failed")]
-
-mod support;
-
+use crate::support::{done, fixture, json};
 use cv_core::{Image, RgbU8};
 use cv_io::{DynImage, Pixels, read_image};
 use std::{fs, path::Path};
-use support::{done, fixture, json};
 
 /// Returns a little-endian EXIF block: maker, orientation and a comment; then a thumbnail.
 fn exif(orientation: u8) -> Vec<u8> {
