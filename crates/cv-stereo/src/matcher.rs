@@ -20,7 +20,7 @@ use crate::speckle::{Speckles, remove_speckles};
 use crate::surface_filling::{self, Filling, Pair, fill};
 use crate::winner::Winner;
 use crate::winner_checks::check_row;
-use crate::{Intensity, IntensityCost, Paths, Search, Smoothing, StereoError, StereoOptions, median, window_sweep};
+use crate::{Intensity, IntensityCost, Paths, Search, StereoError, StereoOptions, median, window_sweep};
 use cv_core::{Cancelled, GrayF32, ImageView, Mask, Progress, Stage, StageClock};
 use fearless_simd::{Level, dispatch};
 use pyramid::Coarse;
@@ -422,6 +422,7 @@ impl StereoMatcher {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Smoothing;
     use cv_core::{GrayU8, Silent};
     use cv_synth::instruction_sets;
 
