@@ -236,10 +236,14 @@ pub(crate) fn check_matched_fraction<T: Intensity, const C: usize>(
 
 /// Converts an image to 8-bit RGB, 16 bits rounded.
 pub(crate) fn to_rgb8<T: Intensity, const C: usize>(photo: ImageView<'_, T, C>) -> RgbU8 {
-    RgbU8::from_fn(photo.width(), photo.height(), |x, y| {
-        let pixel = photo.at(x, y);
-        std::array::from_fn(|c| ((u32::from(pixel[if C >= 3 { c } else { 0 }].to_u16()) + 128) / 257) as u8)
-    })
+    let mut rgb = RgbU8::new(photo.width(), photo.height(), [0; 3]);
+    for y in 0..photo.height() {
+        let pixels = rgb.row_mut(y).as_chunks_mut::<3>().0;
+        for (out, pixel) in pixels.iter_mut().zip(photo.row(y).as_chunks::<C>().0) {
+            *out = std::array::from_fn(|c| ((u32::from(pixel[if C >= 3 { c } else { 0 }].to_u16()) + 128) / 257) as u8);
+        }
+    }
+    rgb
 }
 
 /// Returns the matcher's options, with the range of disparities of feature matches where it is requested. In quality
@@ -310,9 +314,11 @@ pub fn depth<T: Intensity + Pixel, const C: usize>(
     let mut matcher = StereoMatcher::new(stereo)?;
     let limits = (options.range, options.few_matches);
     let mut run = || {
-        matcher.prepare(left.width(), left.height(), &mut DisparityMap::empty(), progress)?;
+        let mut map = DisparityMap::empty();
+        matcher.prepare(left.width(), left.height(), &mut map, progress)?;
         clock.lap("prepare");
-        compute_depth(&mut matcher, [left, right], geometry, limits, &mut alignment, progress).map(|(result, _)| result)
+        let found = compute_depth(&mut matcher, [left, right], map, geometry, limits, &mut alignment, progress)?;
+        Ok(found.0)
     };
     let mut result = match run() {
         Err(DepthError::Cancelled(stop)) => {
@@ -349,7 +355,8 @@ pub fn depth_with<T: Intensity + Pixel, const C: usize>(
     progress: &dyn Progress,
 ) -> Result<DepthResult, DepthError> {
     let limits = (range, FewMatches::default());
-    compute_depth(matcher, [left, right], geometry, limits, &mut Alignment::off(), progress).map(|(result, _)| result)
+    compute_depth(matcher, [left, right], DisparityMap::empty(), geometry, limits, &mut Alignment::off(), progress)
+        .map(|(result, _)| result)
 }
 
 /// Returns the initial state of the vertical alignment.
@@ -362,6 +369,7 @@ pub(crate) fn initial_alignment(options: &DepthOptions) -> Alignment {
 pub(crate) fn compute_depth<T: Intensity + Pixel, const C: usize>(
     matcher: &mut dyn DisparityMatcher<T, C>,
     [left, right]: [ImageView<'_, T, C>; 2],
+    mut map: DisparityMap,
     geometry: Option<&StereoGeometry>,
     (range, policy): ((f32, f32), FewMatches),
     alignment: &mut Alignment,
@@ -369,7 +377,6 @@ pub(crate) fn compute_depth<T: Intensity + Pixel, const C: usize>(
 ) -> Result<(DepthResult, Option<Image<T, C>>), DepthError> {
     check_range(range, geometry)?;
     let mut clock = StageClock::new();
-    let mut map = DisparityMap::empty();
     let corrected = alignment.compute(matcher, [left, right], &mut map, progress)?;
     let right = corrected.as_ref().map_or(right, Image::view);
     clock.lap("match");

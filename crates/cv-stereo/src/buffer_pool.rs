@@ -11,6 +11,15 @@ pub(crate) fn try_for_each<B: Default + Send, I: Send>(
     work: impl Fn(&mut B, I) -> Result<(), Cancelled> + Sync,
 ) -> Result<(), Cancelled> {
     buffers.resize_with(rayon::current_num_threads(), B::default);
+    distribute(buffers, items, work)
+}
+
+/// Calls `work` with each item, in parallel, and one of `buffers`.
+pub(crate) fn distribute<B: Send, I: Send>(
+    buffers: &mut [B],
+    items: impl Iterator<Item = I> + Send,
+    work: impl Fn(&mut B, I) -> Result<(), Cancelled> + Sync,
+) -> Result<(), Cancelled> {
     let items = Mutex::new(items);
     let next = || items.lock().unwrap_or_else(PoisonError::into_inner).next();
     buffers.par_iter_mut().try_for_each(|buffer| {

@@ -36,6 +36,14 @@ impl Prior {
         Self(u16::from(cap) << INDEX_BITS | index)
     }
 
+    pub(crate) fn from_bits(bits: u16) -> Self {
+        Self(bits)
+    }
+
+    pub(crate) fn to_bits(self) -> u16 {
+        self.0
+    }
+
     /// Returns the index from the smallest disparity.
     #[inline(always)]
     pub(crate) fn index(self) -> u16 {

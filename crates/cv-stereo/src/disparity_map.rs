@@ -37,10 +37,11 @@ impl DisparityMap {
         Self { disparity: GrayF32::new(0, 0, [0.0]), state: Image::new(0, 0, [PixelState::Matched]) }
     }
 
+    /// Resizes the map, with unspecified contents, in its memory if that suffices.
     pub(crate) fn resize(&mut self, width: usize, height: usize) {
         if self.disparity.size() != (width, height) {
-            self.disparity = GrayF32::new(width, height, [f32::NAN]);
-            self.state = Image::new(width, height, [PixelState::Matched]);
+            resize(&mut self.disparity, (width, height), f32::NAN);
+            resize(&mut self.state, (width, height), PixelState::Matched);
         }
     }
 
@@ -67,4 +68,12 @@ impl DisparityMap {
     fn count(&self, state: PixelState) -> usize {
         self.state.as_slice().iter().filter(|&&v| v == state).count()
     }
+}
+
+/// Resizes an image in its memory if that suffices.
+fn resize<T: Sample>(image: &mut Image<T, 1>, (width, height): (usize, usize), fill: T) {
+    let mut values = std::mem::replace(image, Image::new(0, 0, [fill])).into_vec();
+    values.clear();
+    values.resize(width * height, fill);
+    *image = Image::from_vec(width, height, values).unwrap_or_else(|_| Image::new(width, height, [fill]));
 }

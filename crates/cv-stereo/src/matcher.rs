@@ -1,8 +1,10 @@
 //! The semi-global matcher: from a rectified pair to checked disparities.
 
+mod pyramid;
+
 use crate::border_mask::Borders;
 use crate::census::{Gray, describe, describe_mirrored, planes};
-use crate::coarse_prior::{Prior, classify_texture, set_priors};
+use crate::coarse_prior::Prior;
 use crate::confidence::{confidence, sigma};
 use crate::cost::{Frame, Penalties};
 use crate::disparity_map::{DisparityMap, PixelState};
@@ -18,9 +20,10 @@ use crate::speckle::{Speckles, remove_speckles};
 use crate::surface_filling::{self, Filling, Pair, fill};
 use crate::winner::Winner;
 use crate::winner_checks::check_row;
-use crate::{Intensity, IntensityCost, Paths, Search, Smoothing, StereoError, StereoOptions, median, window_sweep};
+use crate::{Intensity, IntensityCost, Paths, Search, StereoError, StereoOptions, median, window_sweep};
 use cv_core::{Cancelled, GrayF32, ImageView, Mask, Progress, Stage, StageClock};
 use fearless_simd::{Level, dispatch};
+use pyramid::Coarse;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -29,10 +32,6 @@ const MIN_PYRAMID_SIDE: usize = 16;
 
 /// Fewer disparities than this have no pyramid levels: half of them would agree by chance.
 const MIN_PYRAMID_DISPARITIES: usize = 32;
-
-/// A coarser level gives priors if this fraction of it is matched. Each of the 24 public pairs has 0.65 or more; images of different
-/// scenes, and exchanged ones, which priors would make consistent with themselves, mostly have less.
-const MIN_PRIOR_MATCHED: f64 = 0.6;
 
 /// Matching is hierarchical by [`Search::Auto`] from this many pixels times disparities on, and by [`Search::Hierarchical`], which is also
 /// that of the coarser levels, from the second.
@@ -81,13 +80,6 @@ pub struct StereoMatcher {
     /// The matcher at half resolution, which the priors and windows are from.
     coarse: Option<Box<Coarse>>,
     stages: Vec<(&'static str, f64)>,
-}
-
-/// The pyramid level of half resolution.
-#[derive(Debug)]
-struct Coarse {
-    matcher: StereoMatcher,
-    map: DisparityMap,
 }
 
 impl StereoMatcher {
@@ -162,6 +154,7 @@ impl StereoMatcher {
         }
         self.check_size(width, height)?;
         let mut clock = StageClock::new();
+        self.reclaim_gray();
         for (side, view, gray) in [("left", left, 0), ("right", right, 1)] {
             let count = to_gray(self.level, view, &mut self.gray[gray]);
             if count > 0 {
@@ -192,9 +185,13 @@ impl StereoMatcher {
     ) -> Result<(), StereoError> {
         let (width, height) = (self.gray[0].width, self.gray[0].height);
         progress.report("bits", 0, 1)?;
+        self.gray[0].to_bytes(&mut self.gray8);
+        clock.lap("gray");
+        let coarse = self.match_coarse((width, height), map, progress)?;
+        clock.lap("coarse");
         self.describe_pixels();
         clock.lap("bits");
-        self.match_coarse(width, height, progress)?;
+        self.set_priors(coarse, map, (width, height));
         clock.lap("coarse");
         self.aggregate(width, height, progress)?;
         clock.lap("aggregate");
@@ -276,89 +273,13 @@ impl StereoMatcher {
         if self.is_hierarchical(width, height) { layout.contiguous() } else { layout }
     }
 
-    /// Computes census bits, values of the intensity cost and 8-bit gray levels.
+    /// Computes census bits and values of the intensity cost.
     fn describe_pixels(&mut self) {
         let (level, layout) = (self.level, self.layout(self.gray[0].width, self.gray[0].height));
         let StereoOptions { census, intensity_cost, min_disparity, .. } = self.options;
         let [left, right] = &mut self.described;
         describe(level, &self.gray[0], census, intensity_cost, left);
         describe_mirrored(level, &self.gray[1], census, intensity_cost, i64::from(min_disparity), layout, right);
-        self.gray[0].to_bytes(&mut self.gray8);
-    }
-
-    /// Returns a matcher for half resolution and its bytes; `None` without a further level, and where the memory limit excludes it.
-    pub(crate) fn coarser(&self, width: usize, height: usize) -> Option<(Self, usize)> {
-        let StereoOptions { min_disparity, disparities, pyramid_levels, max_memory, .. } = self.options;
-        let is_hierarchical = self.is_hierarchical(width, height);
-        let is_small = width.min(height) < 2 * MIN_PYRAMID_SIDE || disparities < MIN_PYRAMID_DISPARITIES;
-        if is_small || !is_hierarchical && pyramid_levels == 0 {
-            return None;
-        }
-        let first = min_disparity.div_euclid(2);
-        let last = (min_disparity + disparities as i32 - 1).div_euclid(2);
-        let options = StereoOptions {
-            min_disparity: first,
-            disparities: (last - first + 1) as usize,
-            speckle_size: self.options.speckle_size / 4,
-            confidence: false,
-            quality: false,
-            sequence: false,
-            ..self.options.clone()
-        };
-        let options = if is_hierarchical {
-            let (search, smoothing) = (Search::Hierarchical, Smoothing::None);
-            StereoOptions { search, fill: true, smoothing, max_memory: None, ..options }
-        } else {
-            StereoOptions {
-                search: Search::Full,
-                pyramid_levels: pyramid_levels - 1,
-                paths: Paths::Four,
-                fill: false,
-                smoothing: Smoothing::None,
-                max_memory: max_memory.map(|bytes| bytes / 4),
-                ..options
-            }
-        };
-        let mut coarse = Self::new(options).ok()?;
-        coarse.level = self.level;
-        let bytes = coarse.memory(width / 2, height / 2);
-        coarse.check_memory(width / 2, height / 2, bytes).is_ok().then_some((coarse, bytes))
-    }
-
-    /// Matches at half resolution if enough of the image has low texture, and sets `priors`.
-    fn match_coarse(&mut self, width: usize, height: usize, progress: &dyn Progress) -> Result<(), StereoError> {
-        let is_hierarchical = self.is_hierarchical(width, height);
-        let coarse = self.coarser(width, height);
-        let has_priors = coarse.is_some()
-            && self.options.pyramid_levels > 0
-            && classify_texture(self.level, &self.gray8, width, &mut self.priors);
-        if !has_priors {
-            self.priors.clear();
-        }
-        let Some((new, _)) = coarse.filter(|_| is_hierarchical || has_priors) else { return Ok(()) };
-        // Replaced if the image size gives it other options.
-        let coarse = self.coarse.take().filter(|coarse| coarse.matcher.options == new.options);
-        let mut coarse = coarse.unwrap_or_else(|| Box::new(Coarse { matcher: new, map: DisparityMap::empty() }));
-        let Coarse { matcher, map } = &mut *coarse;
-        for (small, large) in matcher.gray.iter_mut().zip(&self.gray) {
-            small.halve(large);
-        }
-        matcher.borders = self.borders.halved();
-        matcher.compute_gray(map, StageClock::new(), progress)?;
-        let range = (self.options.min_disparity, self.options.disparities);
-        if is_hierarchical {
-            self.windows.set(self.level, map.disparity.as_slice(), width / 2, range);
-            let unmatched = map.disparity.as_mut_slice().iter_mut().zip(map.state.as_slice());
-            unmatched.filter(|(_, state)| **state != PixelState::Matched).for_each(|(d, _)| *d = f32::NAN);
-        }
-        if map.matched_fraction() < MIN_PRIOR_MATCHED {
-            self.priors.clear();
-        } else if has_priors {
-            set_priors(self.level, map.disparity.as_slice(), width / 2, width, range, &mut self.priors);
-        }
-        // Freed where images are large: its memory serves the buffers of this level.
-        self.coarse = (!is_hierarchical).then_some(coarse);
-        Ok(())
     }
 
     /// Aggregates the costs and selects the winners of both views.
@@ -394,12 +315,15 @@ impl StereoMatcher {
         };
         let eight = options.paths == Paths::Eight;
         let is_hierarchical = self.is_hierarchical(width, height);
-        let Aggregator { winners, right, .. } = &mut self.aggregator;
         if is_hierarchical {
+            let Aggregator { sums, winners, right, .. } = &mut self.aggregator;
+            if !options.quality {
+                std::mem::swap(right, &mut self.gray[1].values);
+            }
             winners.resize(width * height, Winner::default());
             right.resize(width * height, 0);
             let frame = frame(0..height);
-            let (windows, buffers) = (&self.windows, &mut self.window_sweeps);
+            let (windows, buffers) = (&self.windows, (sums, &mut self.window_sweeps));
             return window_sweep::aggregate(self.level, &frame, windows, buffers, (winners, right), &stage);
         }
         let Some(rows) = rows else {
@@ -498,6 +422,7 @@ impl StereoMatcher {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Smoothing;
     use cv_core::{GrayU8, Silent};
     use cv_synth::instruction_sets;
 
@@ -562,9 +487,16 @@ mod tests {
                 matcher.level = level;
                 assert!(matcher.is_hierarchical(width, height));
                 let map = pool.install(|| matcher.compute(left.view(), right.view(), &Silent)).unwrap();
-                let bits: Vec<u32> = map.disparity.as_slice().iter().map(|d| d.to_bits()).collect();
-                let expected = first.get_or_insert_with(|| bits.clone());
-                assert!(bits == *expected, "{level:?}, {threads} threads");
+                let bits =
+                    |map: &DisparityMap| map.disparity.as_slice().iter().map(|d| d.to_bits()).collect::<Vec<_>>();
+                let expected = first.get_or_insert_with(|| bits(&map));
+                assert!(bits(&map) == *expected, "{level:?}, {threads} threads");
+                // Again, after a pair of another size in the same buffers.
+                let [other_left, other_right] = pair();
+                for (left, right) in [(&other_left, &other_right), (&left, &right), (&left, &right)] {
+                    let map = pool.install(|| matcher.compute(left.view(), right.view(), &Silent)).unwrap();
+                    assert!(left.width() != width || bits(&map) == *expected, "{level:?}, {threads} threads");
+                }
                 let pixels = (0..height).flat_map(|y| (128..width).map(move |x| (x, y)));
                 let bad = pixels.filter(|&(x, y)| {
                     let truth = if is_near(x, y) { near(y) } else { 24 };

@@ -127,6 +127,7 @@ pub(crate) fn match_reference(
 
 mod tests {
     use super::*;
+    use crate::aligned_buffer::AlignedBuffer;
     use crate::border_mask::BorderMask;
     use crate::census::{Gray, MARGIN, describe, describe_mirrored, planes};
     use crate::cost::{Frame, Penalties};
@@ -392,7 +393,8 @@ mod tests {
                 let stage = cv_core::Stage::new(&cv_core::Silent, "", 0).unwrap();
                 let output = (&mut winners[..], &mut right[..]);
                 pair.with_frame(level, Layout::new(level, options.disparities).contiguous(), |frame| {
-                    window_sweep::aggregate(level, frame, &windows, &mut Vec::new(), output, &stage).unwrap();
+                    let buffers = (&mut AlignedBuffer::default(), &mut Vec::new());
+                    window_sweep::aggregate(level, frame, &windows, buffers, output, &stage).unwrap();
                 });
                 prop_assert_eq!(&winners, &pair.expected.0, "{:?}", level);
             }

@@ -19,7 +19,8 @@ use std::ops::Range;
 /// Buffers of the aggregation, reused between frames.
 #[derive(Debug, Default)]
 pub(crate) struct Aggregator {
-    sums: AlignedBuffer<u8>,
+    /// Of the hierarchical search, the sums of [`crate::window_sweep`].
+    pub(crate) sums: AlignedBuffer<u8>,
     sweeps: [Sweep; 2],
     pub(crate) winners: Vec<Winner>,
     pub(crate) right: Vec<u16>,
