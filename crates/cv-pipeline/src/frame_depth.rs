@@ -3,7 +3,7 @@
 use crate::depth::{check_matched_fraction, check_range, compute_depth, initial_alignment, matcher_options, to_rgb8};
 use crate::vertical_offset::{Alignment, VerticalOffset};
 use crate::{DepthError, DepthOptions, DisparityRange, Progress, RigDepthResult};
-use cv_core::{Image, ImageView, PointCloud, Pose, RgbU8, StageClock, Vector3};
+use cv_core::{Image, ImageView, PointCloud, Pose, StageClock, Vector3};
 use cv_imgproc::{Pixel, WarpMap};
 use cv_stereo::{DisparityMap, Intensity, Rectification, RectifyError, StereoGeometry, StereoMatcher, StereoOptions};
 use std::any::Any;
@@ -110,7 +110,7 @@ impl FrameDepth {
         Ok(&self.map)
     }
 
-    /// Computes disparity and depth of the next frame; the points, and of a rectified pair the images, only if `wanted`.
+    /// Computes disparity and depth of the next frame; the points only if `wanted`.
     ///
     /// # Errors
     /// [`DepthError`] as of [`depth()`](crate::depth()), and [`DepthError::Rectify`] if an image does not have its
@@ -149,11 +149,7 @@ impl FrameDepth {
             compute_depth(matcher, [left, right], map, geometry, limits, &mut self.alignment, progress)?;
         maps.stages.iter().for_each(|(stage, seconds)| clock.add(stage, *seconds));
         maps.stages = clock.into_stages();
-        let images = if wanted || rectified.is_some() {
-            [to_rgb8(left), to_rgb8(corrected.as_ref().map_or(right, Image::view))]
-        } else {
-            [(); 2].map(|()| RgbU8::new(0, 0, [0; 3]))
-        };
+        let images = [to_rgb8(left), to_rgb8(corrected.as_ref().map_or(right, Image::view))];
         let cloud = if wanted { maps.cloud(images[0].view()) } else { None };
         let mut cloud: PointCloud = cloud.unwrap_or_default();
         if let Some(rectification) = &self.rectification {

@@ -8,8 +8,7 @@ use cv_stereo::{Intensity, Rectification};
 /// Result of [`depth_by_rig`] and [`FrameDepth`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct RigDepthResult {
-    /// The images (for a rig rectified), left or upper and right, as 8-bit RGB; empty for a rectified pair of which
-    /// [`FrameDepth::next_depth`] was to compute no points.
+    /// The images (for a rig rectified), left or upper and right, as 8-bit RGB.
     pub images: [RgbU8; 2],
     /// Disparity and depth of the left image. For a rig, the `stages` begin with `rectify`.
     pub maps: DepthResult,
