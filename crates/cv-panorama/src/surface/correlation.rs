@@ -35,9 +35,9 @@ impl Template {
     pub(crate) fn score<'a>(&self, rows: impl Iterator<Item = &'a [f32]>) -> f32 {
         let (mut sum, mut squares, mut product) = (0.0_f32, 0.0_f32, 0.0_f32);
         for (ours, theirs) in self.centered.chunks_exact(self.side).zip(rows) {
+            sum += theirs.iter().fold(0.0, |sum, b| sum + b);
+            squares += theirs.iter().fold(0.0, |sum, b| sum + b * b);
             for (a, b) in ours.iter().zip(theirs) {
-                sum += b;
-                squares += b * b;
                 product += a * b;
             }
         }
@@ -54,17 +54,34 @@ impl Template {
     fn scores_inner(&self, window: &[f32]) -> [f32; SEARCH_SIDE * SEARCH_SIDE] {
         let wide = self.side + 2 * SEARCH_RADIUS;
         debug_assert_eq!(window.len(), wide * wide + PAD);
+        let row = |r: usize| &window[r * wide..][..self.side - 1 + LANES];
+        // Sums along each row of the window, which all vertical shifts share. (Arrays of their own, which stay in registers.)
+        let mut along = Vec::with_capacity(wide);
+        for r in 0..wide {
+            let (mut sum, mut squares) = ([0.0_f32; LANES], [0.0_f32; LANES]);
+            for theirs in row(r).windows(LANES) {
+                for k in 0..LANES {
+                    sum[k] += theirs[k];
+                    squares[k] += theirs[k] * theirs[k];
+                }
+            }
+            along.push((sum, squares));
+        }
         let mut scores = [0.0; SEARCH_SIDE * SEARCH_SIDE];
         for (dy, out) in scores.chunks_exact_mut(SEARCH_SIDE).enumerate() {
-            let (mut sum, mut squares, mut product) = ([0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
+            let mut product = [0.0_f32; LANES];
             for (r, ours) in self.centered.chunks_exact(self.side).enumerate() {
-                let row = &window[(r + dy) * wide..][..self.side - 1 + LANES];
-                for (a, theirs) in ours.iter().zip(row.windows(LANES)) {
+                for (a, theirs) in ours.iter().zip(row(r + dy).windows(LANES)) {
                     for k in 0..LANES {
-                        sum[k] += theirs[k];
-                        squares[k] += theirs[k] * theirs[k];
                         product[k] += a * theirs[k];
                     }
+                }
+            }
+            let (mut sum, mut squares) = ([0.0_f32; LANES], [0.0_f32; LANES]);
+            for (row_sum, row_squares) in &along[dy..dy + self.side] {
+                for k in 0..LANES {
+                    sum[k] += row_sum[k];
+                    squares[k] += row_squares[k];
                 }
             }
             for (k, out) in out.iter_mut().enumerate() {
