@@ -154,6 +154,7 @@ impl StereoMatcher {
         }
         self.check_size(width, height)?;
         let mut clock = StageClock::new();
+        progress.report("bits", 0, 1)?;
         self.reclaim_gray();
         for (side, view, gray) in [("left", left, 0), ("right", right, 1)] {
             let count = to_gray(self.level, view, &mut self.gray[gray]);

@@ -67,10 +67,8 @@ pub(crate) fn label_bounds(labels: &Image<u16, 1>, n: usize) -> Vec<Option<Bound
 /// Half width, in preview pixels, of the band around the seams of the halved preview in which the seams of the preview are found: a cut over the whole
 /// preview takes several times as long for hardly less energy.
 const BAND_RADIUS: usize = 4;
-/// Minimum number of pixels of the halved preview from which on its seams are found in a band too, around those of a quarter of the resolution.
-const MIN_QUARTERED_PIXELS: usize = 10_000;
 
-/// Finds the labels on the preview: unrestricted at a quarter or, where that is small, half of its resolution, then in bands around those seams at half and full resolution.
+/// Finds the labels on the preview: unrestricted at half resolution, then in a band around those seams.
 pub(crate) fn on_preview(
     preview: &Preview,
     photo_of: &[usize],
@@ -93,6 +91,7 @@ pub(crate) fn on_preview(
         difference(pieces[a], pieces[b], x, y) + (MISALIGNMENT_COST * off.clamp(0.0, MAX_MISALIGNMENT_PX)) as i32
     };
     let half = preview.halved();
+    let mut coarse = voronoi(&half);
     // The maximum over four pixels: their mean would hide a thin object that the seam cuts.
     let max_difference = |a: usize, b: usize, x: usize, y: usize| {
         let four = [(0, 0), (1, 0), (0, 1), (1, 1)];
@@ -105,37 +104,21 @@ pub(crate) fn on_preview(
         (2.0 * (data_term(&half.pieces[label], clipped, x, y) + transient)) as i32
     };
     let reach: Vec<_> = half.pieces.iter().map(|p| Some(&p.warped)).collect();
-    let mut coarse = voronoi(&half);
-    if half.width * half.height >= MIN_QUARTERED_PIXELS {
-        let quarter = half.halved();
-        let mut coarsest = voronoi(&quarter);
-        let differ = |a: usize, b: usize, x: usize, y: usize| {
-            let four = [(0, 0), (1, 0), (0, 1), (1, 1)];
-            four.into_iter().map(|(i, j)| max_difference(a, b, 2 * x + i, 2 * y + j)).fold(0, i32::max)
-        };
-        let quarter_transients = removes_transients.then(|| transient_costs(&quarter));
-        let data = |label: usize, x: usize, y: usize| {
-            let transient = transient_at(quarter_transients.as_deref(), &quarter, label, x, y);
-            (4.0 * (data_term(&quarter.pieces[label], clipped, x, y) + transient)) as i32
-        };
-        let pieces: Vec<_> = quarter.pieces.iter().map(|p| Some(&p.warped)).collect();
-        let labeling = Labeling { photos: &pieces, unary: data, difference: differ, free: |_, _| true };
-        labeling.expand(&mut coarsest, 2, &stage)?;
-        carry_over(&coarsest, &half, &mut coarse);
-        let near = seam_band(&coarse, BAND_RADIUS, &stage)?;
-        let width = half.width;
-        let free = |x: usize, y: usize| near[y * width + x];
-        let labeling = Labeling { photos: &reach, unary: pixel, difference: max_difference, free };
-        labeling.expand(&mut coarse, 1, &stage)?;
-    } else {
-        // Further rounds hardly lower the energy.
-        let labeling = Labeling { photos: &reach, unary: pixel, difference: max_difference, free: |_, _| true };
-        labeling.expand(&mut coarse, 2, &stage)?;
-    }
+    // Further rounds hardly lower the energy.
+    let labeling = Labeling { photos: &reach, unary: pixel, difference: max_difference, free: |_, _| true };
+    labeling.expand(&mut coarse, 2, &stage)?;
     stage.add(1)?;
 
     let width = preview.width;
-    carry_over(&coarse, preview, &mut labels);
+    for (i, label) in labels.as_mut_slice().iter_mut().enumerate() {
+        let (x, y) = (i % width, i / width);
+        if let Some([found]) = coarse.get(x / 2, y / 2)
+            && found != NO_PHOTO
+            && preview.pieces[usize::from(found)].warped.reaches(x, y)
+        {
+            *label = found;
+        }
+    }
     let near = seam_band(&labels, BAND_RADIUS, &stage)?;
     let transients = removes_transients.then(|| transient_costs(preview));
     let pixel = |label: usize, x: usize, y: usize| {
@@ -147,20 +130,6 @@ pub(crate) fn on_preview(
     labeling.expand(&mut labels, 1, &stage)?;
     stage.add(1)?;
     Ok(labels)
-}
-
-/// Sets the labels of a preview to those of its half, where those photographs cover its pixels.
-fn carry_over(coarse: &Image<u16, 1>, preview: &Preview, labels: &mut Image<u16, 1>) {
-    let width = preview.width;
-    for (i, label) in labels.as_mut_slice().iter_mut().enumerate() {
-        let (x, y) = (i % width, i / width);
-        if let Some([found]) = coarse.get(x / 2, y / 2)
-            && found != NO_PHOTO
-            && preview.pieces[usize::from(found)].warped.reaches(x, y)
-        {
-            *label = found;
-        }
-    }
 }
 
 /// Labels every pixel with the photograph whose center is nearest.
