@@ -132,21 +132,25 @@ impl PairDepth {
     }
 
     /// Returns the points in the frame of the first camera.
-    pub(crate) fn cloud(&self) -> PointCloud {
+    ///
+    /// # Errors
+    /// [`Cancelled`].
+    pub(crate) fn cloud(&self, progress: &dyn Progress) -> Result<PointCloud, Cancelled> {
+        let stage = Stage::new(progress, "cloud", self.rows.len())?;
         let to_camera = self.view.rotation.inverse();
-        let (positions, colors) = self
-            .rows
-            .par_iter()
-            .enumerate()
-            .flat_map_iter(|(y, row)| {
-                row.iter().enumerate().filter(|(_, z)| z.is_finite()).map(move |(x, z)| {
-                    let n = self.view.camera.normalize(Point2::new(x as f64, y as f64));
-                    let p = to_camera * (Point3::new(n.x, n.y, 1.0) * f64::from(*z));
-                    ([p.x as f32, p.y as f32, p.z as f32], self.image.at(x, y))
-                })
-            })
-            .unzip();
-        PointCloud::colored(positions, colors)
+        let points_of_row = |(y, row): (usize, &Vec<f32>)| {
+            stage.add(1)?;
+            let points = row.iter().enumerate().filter(|(_, z)| z.is_finite()).map(|(x, z)| {
+                let n = self.view.camera.normalize(Point2::new(x as f64, y as f64));
+                let p = to_camera * (Point3::new(n.x, n.y, 1.0) * f64::from(*z));
+                ([p.x as f32, p.y as f32, p.z as f32], self.image.at(x, y))
+            });
+            Ok(points.collect())
+        };
+        let rows: Vec<Vec<([f32; 3], [u8; 3])>> =
+            self.rows.par_iter().enumerate().map(points_of_row).collect::<Result<_, Cancelled>>()?;
+        let (positions, colors) = rows.into_iter().flatten().unzip();
+        Ok(PointCloud::colored(positions, colors))
     }
 
     /// Returns the depth along the axis of the first camera for each pixel of its image, NaN where unknown.

@@ -135,7 +135,7 @@ pub fn reconstruct_dense(
     let pair = pair_depth(photos, &rig, &positions, options, progress)?;
     let mut stages = pair.stages.clone();
     let mut after = StageClock::new();
-    let (cloud, depth) = (pair.cloud(), pair.depth_map(&cameras[0], progress)?);
+    let (cloud, depth) = (pair.cloud(progress)?, pair.depth_map(&cameras[0], progress)?);
     after.lap("cloud");
     // The reduction counts as rectification.
     let ours = clock.into_stages().into_iter().chain(after.into_stages());
