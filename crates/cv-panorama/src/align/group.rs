@@ -18,8 +18,6 @@ pub(crate) struct Group<'a> {
     pub(crate) pairs: Vec<&'a VerifiedPair>,
     /// Of `pairs`, in members' indices and centered pixels.
     overlaps: Vec<Overlap>,
-    /// Of those, at most [`MAX_MATCHES`] each, uniformly.
-    adjusted: Vec<Overlap>,
     graph: PairGraph,
     tree: Vec<usize>,
     reference: usize,
@@ -28,9 +26,6 @@ pub(crate) struct Group<'a> {
 
 /// Maximum number of matches per overlap in the initial adjustment: thirty times the three unknowns of a rotation.
 const MAX_INITIAL_MATCHES: usize = 100;
-
-/// Maximum number of matches per overlap in the adjustments: as many as the registered patches that refine the result.
-const MAX_MATCHES: usize = 300;
 
 /// Minimum spread of log focal lengths at which photographs get separate focal lengths (zoom); refocusing changes them by less.
 const MIN_ZOOM_LOG_SPREAD: f64 = 0.03;
@@ -56,15 +51,6 @@ fn undistorted(p: &Photo, pixel: Point2<f64>) -> Vector2<f64> {
         Some(c) => c.normalize(pixel).coords * c.fx,
         None => pixel.coords - center(p),
     }
-}
-
-/// Subsamples the matches of each overlap uniformly, to at most `count`.
-fn subsampled(overlaps: &[Overlap], count: usize) -> Vec<Overlap> {
-    let subsample = |o: &Overlap| {
-        let step = o.points.len().div_ceil(count).max(1);
-        Overlap { points: o.points.iter().copied().step_by(step).collect(), ..*o }
-    };
-    overlaps.iter().map(subsample).collect()
 }
 
 impl<'a> Group<'a> {
@@ -97,8 +83,7 @@ impl<'a> Group<'a> {
         let tree = graph.maximum_spanning_forest();
         let reference = graph.center(&tree).unwrap_or(0);
         let photos = members.iter().map(|&m| photos[m]).collect();
-        let adjusted = subsampled(&overlaps, MAX_MATCHES);
-        Ok(Self { members, photos, pairs: kept, overlaps, adjusted, graph, tree, reference, components })
+        Ok(Self { members, photos, pairs: kept, overlaps, graph, tree, reference, components })
     }
 
     /// Groups photographs by shared intrinsics: the group of each photograph, and a representative photograph of each group.
@@ -172,7 +157,7 @@ impl<'a> Group<'a> {
     fn problem<'p>(&'p self, kind: Motion, lens_of: &'p [usize], prior: &'p [(f64, f64)], scale: f64) -> Problem<'p> {
         Problem {
             kind,
-            overlaps: &self.adjusted,
+            overlaps: &self.overlaps,
             lens_of,
             fixed: self.reference,
             free_focal: kind == Motion::Rotation && self.photos.iter().any(|p| p.camera.is_none()),
@@ -180,6 +165,15 @@ impl<'a> Group<'a> {
             focal_prior: prior,
             loss: RobustLoss::Cauchy { scale },
         }
+    }
+
+    /// Subsamples the matches of each overlap uniformly for the initial adjustment.
+    fn subsampled_overlaps(&self) -> Vec<Overlap> {
+        let subsample = |o: &Overlap| {
+            let step = o.points.len().div_ceil(MAX_INITIAL_MATCHES).max(1);
+            Overlap { points: o.points.iter().copied().step_by(step).collect(), ..*o }
+        };
+        self.overlaps.iter().map(subsample).collect()
     }
 
     pub(crate) fn solve(
@@ -217,7 +211,7 @@ impl<'a> Group<'a> {
         let prior = self.focal_guesses(&representatives);
         let known = representatives.iter().all(|&h| self.photos[h].camera.is_some() || self.photos[h].focal.is_some());
         let factors: &[f64] = if known { &[1.0] } else { &[1.0, 0.6, 1.7, 3.0] };
-        let few = subsampled(&self.overlaps, MAX_INITIAL_MATCHES);
+        let few = self.subsampled_overlaps();
         let wide =
             Problem { overlaps: &few, ..self.problem(Motion::Rotation, &lens_of, &prior, 10.0 * options.outlier_px) };
         let start = |factor: &f64| {
@@ -279,7 +273,7 @@ impl<'a> Group<'a> {
             .map(|&h| Lens { log_focal: self.photos[h].expected_focal().ln(), k1: 0.0 })
             .collect();
         let motion = self.compose(Motion::Homography, &lens_of, &lenses);
-        let few = subsampled(&self.overlaps, MAX_INITIAL_MATCHES);
+        let few = self.subsampled_overlaps();
         let wide =
             Problem { overlaps: &few, ..self.problem(Motion::Homography, &lens_of, &prior, 10.0 * options.outlier_px) };
         let (state, _) = wide.solve(State { motion, lenses }, 30);

@@ -38,8 +38,8 @@ const MAX_MEDIAN_RATIO: f64 = 0.4;
 const MIN_MATCHES: usize = 20;
 /// Maximum number of Gauss-Newton iterations.
 const MAX_ITERATIONS: usize = 8;
-/// Size of the last step in pixels. Convergence is nearly quadratic: what remains is some thousandths.
-const TOLERANCE_PX: f64 = 0.03;
+/// Convergence tolerance in pixels.
+const TOLERANCE_PX: f64 = 0.01;
 /// Maximum correction of a match in pixels.
 const MAX_CORRECTION_PX: f64 = 2.0;
 /// Minimum correlation of the registered patches.
@@ -90,24 +90,18 @@ pub fn refine_alignment(
     let has_parallax = alignment.median_px > MAX_MEDIAN_RATIO * options.outlier_px;
     let outlier_px = options.outlier_px * if has_parallax { 1.0 } else { NARROW_LOSS_RATIO };
     let options = AlignOptions { motion: alignment.motion, outlier_px, ..*options };
-    let solve = |start: &Alignment, refined: &[VerifiedPair], options: &AlignOptions| {
+    let solve = |start: &Alignment, options: &AlignOptions| {
         // The focal lengths found are where the search for better ones starts.
         let focal = |i: usize| start.views.get(i).and_then(|v| v.as_ref().ok()).map(|v| v.camera.fx);
         let photos: Vec<Photo> =
             photos.iter().enumerate().map(|(i, p)| Photo { focal: focal(i).or(p.focal), ..*p }).collect();
-        align(&photos, refined, options, progress)
+        align(&photos, &refined, options, progress)
     };
-    // A part of them suffices for the scale of their errors.
-    let first = if has_parallax {
-        solve(&alignment, &refined, &options)
-    } else {
-        solve(&alignment, &thinned(&refined), &options)
-    };
-    let found = match first {
+    let found = match solve(&alignment, &options) {
         // The median residual is known now: registrations beyond a few times as far off are false.
         Ok(found) if !has_parallax => {
             let scale = (LOSS_PER_MEDIAN * found.median_px).clamp(MIN_LOSS_PX, options.outlier_px);
-            solve(&found, &refined, &AlignOptions { outlier_px: scale, ..options })
+            solve(&found, &AlignOptions { outlier_px: scale, ..options })
         }
         other => other,
     };
@@ -124,16 +118,6 @@ pub fn refine_alignment(
     found.pairs = alignment.pairs;
     found.measure();
     Ok(found)
-}
-
-/// Every third match of each pair that has many.
-fn thinned(pairs: &[VerifiedPair]) -> Vec<VerifiedPair> {
-    let thinned = |pair: &VerifiedPair| {
-        let step = if pair.matches.len() < 6 * MIN_MATCHES { 1 } else { 3 };
-        let matches: Vec<Correspondence> = pair.matches.iter().copied().step_by(step).collect();
-        VerifiedPair { inliers: (0..matches.len()).collect(), matches, ..pair.clone() }
-    };
-    pairs.iter().map(thinned).collect()
 }
 
 /// Positions where patches are registered: `count` at most, half of them at features, the others on a grid over the overlap.

@@ -9,6 +9,7 @@ use crate::masks::{PhotoMask, is_removed, is_removed_near};
 use crate::surface::structure_tensor::StructureTensor;
 use crate::surface::{DisplacementField, Layout, PAD, Placement, SEARCH_RADIUS, SEARCH_SIDE, Surface, Template};
 use cv_core::{Cancelled, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
+use cv_imgproc::bilinear_at;
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 use std::ops::Deref;
@@ -175,8 +176,6 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
     let mut d: Vec<Vector2<f64>> = fields.iter().flat_map(|f| f.displacement.iter().copied()).collect();
     let left = |d: &[Vector2<f64>], t: &[(usize, f64); 8]| -> Vector2<f64> { t.iter().map(|&(i, w)| d[i] * w).sum() };
     for round in 0..5 {
-        // All rounds but the last only give weights.
-        let tolerance = if round < 4 { 1e-4 } else { 1e-6 };
         // The scale shrinks from round to round (graduated non-convexity).
         let scale = scale * f64::from(1 << (4 - round.min(4)));
         let weight = |(t, want, normal): &Term| {
@@ -213,7 +212,7 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
                 diagonal[i] += axes * (c * c * w);
             }
         }
-        conjugate_gradients(apply, &right, &diagonal, &mut d, tolerance, stage)?;
+        conjugate_gradients(apply, &right, &diagonal, &mut d, stage)?;
     }
     for (f, offset) in fields.iter_mut().zip(&offsets) {
         let len = f.displacement.len();
@@ -222,14 +221,12 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
     Ok(())
 }
 
-/// Solves by conjugate gradients with Jacobi preconditioner, starting from `x`, until the squared norm of the residual is below `tolerance` times that of the right-hand side: at 1e-6 a
-/// displacement of some pixels is exact to some thousandths.
+/// Solves by conjugate gradients with Jacobi preconditioner, starting from `x`.
 fn conjugate_gradients(
     apply: impl Fn(&[Vector2<f64>]) -> Vec<Vector2<f64>>,
     right: &[Vector2<f64>],
     diagonal: &[Vector2<f64>],
     x: &mut [Vector2<f64>],
-    tolerance: f64,
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
     let dot = |a: &[Vector2<f64>], b: &[Vector2<f64>]| -> f64 { a.iter().zip(b).map(|(a, b)| a.dot(b)).sum() };
@@ -247,7 +244,8 @@ fn conjugate_gradients(
         if iteration % 8 == 0 {
             stage.check()?;
         }
-        if rz <= tolerance * whole.max(1e-6) {
+        // Convergence tolerance: a thousandth of a pixel.
+        if rz <= 1e-8 * whole.max(1e-6) {
             break;
         }
         let product = apply(&direction);
@@ -272,7 +270,7 @@ const PATCH_RADIUS: usize = 8;
 /// Radius in canvas pixels of what is compared with a patch.
 const WINDOW_RADIUS: usize = PATCH_RADIUS + SEARCH_RADIUS;
 /// Maximum number of patches per overlap.
-const MAX_PATCHES: usize = 400;
+const MAX_PATCHES: usize = 800;
 
 /// A canvas position where the patches of two placements are registered.
 struct PatchSite {
@@ -430,10 +428,7 @@ fn patch(
     Some(values)
 }
 
-/// Maximum number of samples of a patch along a row.
-const MAX_SIDE: usize = 2 * WINDOW_RADIUS + 1;
-
-/// Samples the positions `corner + i ux + j uy` of a rectangle, `side` wide, inside the image, bilinearly. One loop per step, so that all but the lookups are vectorized.
+/// Samples the positions `corner + i ux + j uy` of a rectangle, `side` wide, inside the image.
 #[inline(always)]
 fn sample_patch(
     photo: &GrayU8,
@@ -445,30 +440,15 @@ fn sample_patch(
 ) {
     let (width, height) = photo.size();
     let (right, bottom) = ((width - 2) as f32, (height - 2) as f32);
-    let pixels = photo.as_slice();
+    let view = photo.view();
     for (j, row) in values.chunks_exact_mut(side).enumerate() {
         let (u0, v0) = (corner.x + uy.x * j as f32, corner.y + uy.y * j as f32);
-        let (mut fx, mut fy) = ([0.0_f32; MAX_SIDE], [0.0_f32; MAX_SIDE]);
-        let (mut columns, mut rows) = ([0_i32; MAX_SIDE], [0_i32; MAX_SIDE]);
-        for i in 0..MAX_SIDE {
+        for (i, value) in row.iter_mut().enumerate() {
             let (u, v) = (u0 + ux.x * i as f32, v0 + ux.y * i as f32);
-            // Single-precision rounding may reach the last column or row; samples beyond `side` are not used.
-            let (x, y) = (u.max(0.0).min(right) as i32, v.max(0.0).min(bottom) as i32);
-            (fx[i], fy[i], columns[i], rows[i]) = (u - x as f32, v - y as f32, x, y);
+            // Single-precision rounding may reach the last column or row.
+            let (x, y) = (u.min(right) as usize, v.min(bottom) as usize);
+            [*value] = bilinear_at(view, x, y, u - x as f32, v - y as f32);
         }
-        // The four pixels around a position in one word.
-        let mut squares = [0_u32; MAX_SIDE];
-        for i in 0..side.min(MAX_SIDE) {
-            let square = &pixels[rows[i] as usize * width + columns[i] as usize..][..width + 2];
-            squares[i] = u32::from_le_bytes([square[0], square[1], square[width], square[width + 1]]);
-        }
-        let mut sampled = [0.0_f32; MAX_SIDE];
-        for i in 0..MAX_SIDE {
-            let [a, b, c, d] = [0, 8, 16, 24].map(|shift| ((squares[i] >> shift) & 0xff) as f32);
-            let (top, bottom) = (a + fx[i] * (b - a), c + fx[i] * (d - c));
-            sampled[i] = top + fy[i] * (bottom - top);
-        }
-        row.copy_from_slice(&sampled[..side]);
     }
 }
 
@@ -661,7 +641,7 @@ mod tests {
         };
         let diagonal: Vec<Vector2<f64>> = (0..n).map(|i| Vector2::repeat(matrix[(i, i)])).collect();
         let mut x = vec![Vector2::new(0.5, -0.5); n];
-        conjugate_gradients(apply, &right, &diagonal, &mut x, 1e-8, &stage()).unwrap();
+        conjugate_gradients(apply, &right, &diagonal, &mut x, &stage()).unwrap();
         for axis in 0..2 {
             let b = DVector::from_iterator(n, right.iter().map(|r| r[axis]));
             let direct = matrix.clone().cholesky().unwrap().solve(&b);
