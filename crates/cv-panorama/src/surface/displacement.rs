@@ -68,7 +68,6 @@ impl DisplacementField {
     }
 
     /// Adds the offsets to the sampling positions of one canvas row that starts at column `left`.
-    #[inline(always)]
     pub(crate) fn add_row(&self, y: f64, left: f64, us: &mut [f32], vs: &mut [f32]) {
         let v = ((y - self.top) / self.spacing).clamp(0.0, self.rows as f64 - 1.0001);
         let (row, fy) = (v as usize * self.columns, v.fract() as f32);
@@ -78,25 +77,17 @@ impl DisplacementField {
         };
         let (start, step) = (((left - self.left) / self.spacing) as f32, (1.0 / self.spacing) as f32);
         let last = self.columns as f32 - 1.0001;
-        let mut i = 0;
-        while i < us.len() {
-            // One cell at a time, so that the pixels in it are vectorized.
-            let cell = position(start, step, last, i) as usize;
-            let mut end = (((cell + 1) as f32 - start) / step) as usize;
-            end = end.clamp(i + 1, us.len());
-            while end < us.len() && position(start, step, last, end) as usize == cell {
-                end += 1;
+        let mut cell = usize::MAX;
+        let (mut a, mut b) = ([0.0; 2], [0.0; 2]);
+        for (i, (u, v)) in us.iter_mut().zip(vs).enumerate() {
+            let x = (start + i as f32 * step).clamp(0.0, last);
+            if x as usize != cell {
+                cell = x as usize;
+                (a, b) = (vertex(cell), vertex(cell + 1));
             }
-            while end > i + 1 && position(start, step, last, end - 1) as usize != cell {
-                end -= 1;
-            }
-            let (a, b) = (vertex(cell), vertex(cell + 1));
-            for (k, (u, v)) in us[i..end].iter_mut().zip(&mut vs[i..end]).enumerate() {
-                let f = position(start, step, last, i + k) - cell as f32;
-                *u += a[0] + (b[0] - a[0]) * f;
-                *v += a[1] + (b[1] - a[1]) * f;
-            }
-            i = end;
+            let f = x - cell as f32;
+            *u += a[0] + (b[0] - a[0]) * f;
+            *v += a[1] + (b[1] - a[1]) * f;
         }
     }
 
@@ -114,12 +105,6 @@ impl DisplacementField {
             }
         }
     }
-}
-
-/// Grid column of pixel `i` of a row.
-#[inline(always)]
-fn position(start: f32, step: f32, last: f32, i: usize) -> f32 {
-    (start + i as f32 * step).clamp(0.0, last)
 }
 
 /// Map from panorama pixels to photograph pixels, displacement fields included.
