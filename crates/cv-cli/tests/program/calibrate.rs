@@ -1,6 +1,6 @@
 //! `cv calibrate`, `cv undistort` and `cv calibration` as a black box. The guides test their ordinary use.
 
-use crate::support::{json, refused, run};
+use crate::support::{done, json, refused, run};
 use cv_core::{GrayU8, RgbU8};
 use std::fs;
 
@@ -43,7 +43,7 @@ fn a_camera_round_trips_through_every_format_and_undistorts() {
         ("colmap", "cameras.txt"),
         ("mrcal", "cam.cameramodel"),
     ] {
-        crate::support::done(folder.path(), &["calibration", "convert", "cam.yaml", "-o", file, "--format", format]);
+        done(folder.path(), &["calibration", "convert", "cam.yaml", "-o", file, "--format", format]);
         assert_eq!(shown(file), truth, "{format}");
     }
     let photo = RgbU8::from_fn(160, 120, |x, y| [(x * 3 % 256) as u8, (y * 2) as u8, 128]);
@@ -90,7 +90,7 @@ fn boards_are_drawn_deterministically_in_every_format() {
 fn a_board_sheet_or_a_single_camera_is_refused_as_a_rig() {
     let folder = tempfile::tempdir().unwrap();
     let board = ["--kind", "aprilgrid", "--board", "3x2", "--marker", "40"];
-    crate::support::done(folder.path(), &[&["board", "-o", "1.png", "--dpi", "60"], &board[..]].concat());
+    done(folder.path(), &[&["board", "-o", "1.png", "--dpi", "60"], &board[..]].concat());
     let rig = [&["calibrate", "rig", "-o", "rig.yaml", "--cameras", "1.png", "1.png", "1.png"], &board[..]].concat();
     // The board is detected in all three photographs, and the single view is too few.
     let said = refused(folder.path(), &rig).stderr;

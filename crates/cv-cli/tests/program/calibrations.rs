@@ -1,6 +1,6 @@
 //! Cameras and rigs in the file formats of other programs.
 
-use crate::support::{json, refused, run};
+use crate::support::{Ran, json, refused, run, strs};
 use cv_core::RgbU8;
 use serde_json::Value;
 use std::{fs, path::Path};
@@ -17,7 +17,7 @@ fn write_matches(folder: &Path) {
 }
 
 /// Returns the message of `cv estimate` for a camera file.
-fn estimate(folder: &Path, camera: &str, more: &[&str]) -> crate::support::Ran {
+fn estimate(folder: &Path, camera: &str, more: &[&str]) -> Ran {
     fs::write(folder.join("camera.txt"), camera).unwrap();
     run(folder, &[&["estimate", "essential", "--matches", "m.txt", "--camera", "camera.txt"], more].concat())
 }
@@ -81,7 +81,7 @@ fn rectify_args(folder: &Path, files: &[&str]) -> Vec<String> {
 fn rectified(files: &[&str]) -> Value {
     let folder = tempfile::tempdir().unwrap();
     // Images without features: the calibration cannot be checked.
-    json(folder.path(), &crate::support::strs(&rectify_args(folder.path(), files)))
+    json(folder.path(), &strs(&rectify_args(folder.path(), files)))
 }
 
 #[test]
@@ -108,14 +108,11 @@ fn an_incomplete_opencv_rig_names_the_missing_file() {
     let [intrinsics, extrinsics] = opencv_files();
     for half in [&intrinsics, &extrinsics] {
         let folder = tempfile::tempdir().unwrap();
-        let ran = refused(folder.path(), &crate::support::strs(&rectify_args(folder.path(), &[half])));
+        let ran = refused(folder.path(), &strs(&rectify_args(folder.path(), &[half])));
         assert!(ran.stderr.contains("there is no ") && ran.stderr.contains("--rig extrinsics.yml"), "{ran:?}");
     }
     let folder = tempfile::tempdir().unwrap();
-    let ran = run(
-        folder.path(),
-        &crate::support::strs(&rectify_args(folder.path(), &[&intrinsics, &extrinsics, &extrinsics])),
-    );
+    let ran = run(folder.path(), &strs(&rectify_args(folder.path(), &[&intrinsics, &extrinsics, &extrinsics])));
     assert!(ran.code == Some(2) && ran.stderr.contains("3 times"), "{ran:?}");
 }
 

@@ -1,6 +1,6 @@
 //! `cv depth` and `cv eval disparity` as a black box.
 
-use crate::support::{done, json, refused, run};
+use crate::support::{cv, done, json, refused, run};
 use cv_core::{Camera, Image, RgbU8};
 use cv_synth::{RenderOptions, Scene, StereoPair, stereo_pair};
 use std::sync::LazyLock;
@@ -460,7 +460,7 @@ fn peak_of_frames(frames: usize, more: &[&str]) -> f64 {
         }
     }
     std::fs::create_dir(folder.path().join("out")).unwrap();
-    let mut child = crate::support::cv(folder.path())
+    let mut child = cv(folder.path())
         .args(["depth", "left", "right", "-o", "out", "--quiet", "--threads", "2"])
         .args(more)
         .spawn()

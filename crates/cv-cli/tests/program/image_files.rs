@@ -1,7 +1,7 @@
 //! Every command that reads images, with valid, unusual and broken files.
 
 use crate::support::{
-    JOBS, done, odd_name, refused, run, snapshot, strs, write_broken, write_cmyk, write_lossless_variants,
+    JOBS, cv, done, odd_name, refused, run, snapshot, strs, write_broken, write_cmyk, write_lossless_variants,
 };
 use cv_core::{GrayU8, Image, RgbU8};
 use std::fs;
@@ -203,7 +203,7 @@ fn photographs_are_read_once() {
             // The thread ends when all has been read; a second open of the pipe would block forever.
             std::thread::spawn(move || fs::write(path, bytes));
         }
-        let mut command = crate::support::cv(folder.path());
+        let mut command = cv(folder.path());
         let mut child = command.args(job.args(&inputs)).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         let start = Instant::now();
         // Far longer than a job on small images takes on a busy machine.
