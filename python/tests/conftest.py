@@ -12,6 +12,11 @@ import pytest
 # A shell that runs the tests in the background makes them, and all their child processes, ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+
+def pytest_configure(config):
+    config.addinivalue_line("markers", "cluster: starts the processes of a cluster")
+
+
 FIXTURES = Path(os.environ.get("EPIPOLE_FIXTURES", Path(__file__).parents[2] / "fixtures"))
 
 

@@ -54,7 +54,12 @@ def program(path):
 GUIDES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "notebooks").glob("*.ipynb"))]
 
 
-@pytest.mark.parametrize("path", GUIDES, ids=lambda path: path.name)
+def marked(path):
+    """Returns the parameter of a test of a guide; the one that starts a cluster is marked."""
+    return pytest.param(path, id=path.name, marks=[pytest.mark.cluster] if path.name == "cluster.md" else [])
+
+
+@pytest.mark.parametrize("path", [marked(path) for path in GUIDES])
 def test_a_guide_runs(path, photographs, tmp_path):
     for module in NEEDS.get(path.name, []):
         pytest.importorskip(module)

@@ -12,6 +12,7 @@ import pytest
 import scenes
 from conftest import FIXTURES
 
+pytestmark = pytest.mark.cluster
 ray = pytest.importorskip("ray")
 
 

@@ -3,7 +3,7 @@
 use crate::{peers, root, target_dir};
 use anyhow::{Context, Result, ensure};
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
 
 /// Oldest supported version of Python.
 const MIN_PYTHON: (u32, u32) = (3, 10);
@@ -64,11 +64,18 @@ pub(crate) fn run(release: bool) -> Result<bool> {
     }
     peers::check(pip(&["--no-deps"]).arg(wheel))?;
     let program = built_program(release, &target)?;
-    let mut tests = Command::new(&interpreter);
-    tests.args(["-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider"]).arg(sources.join("tests")).current_dir(&folder);
-    tests.env("EPIPOLE_FIXTURES", root().join("fixtures")).env("EPIPOLE_PROGRAM", program);
-    let status = tests.status().context("pytest")?;
-    Ok(status.success())
+    let tests = |mark: &str| {
+        let mut command = Command::new(&interpreter);
+        command.args(["-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "-m", mark]).arg(sources.join("tests"));
+        command.env("EPIPOLE_FIXTURES", root().join("fixtures")).env("EPIPOLE_PROGRAM", &program).current_dir(&folder);
+        command
+    };
+    // The processes of a cluster mostly wait for each other: its tests take no longer beside the others.
+    let cluster = tests("cluster").stdout(Stdio::piped()).spawn().context("pytest")?;
+    let others = tests("not cluster").status().context("pytest")?;
+    let cluster = cluster.wait_with_output().context("pytest")?;
+    print!("{}", String::from_utf8_lossy(&cluster.stdout));
+    Ok(others.success() && cluster.status.success())
 }
 
 /// Builds the program, with which the tests compare the package, in the profile of the wheel, and returns its path. Its features are those of the whole workspace, as in `.ci/run`.
