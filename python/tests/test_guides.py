@@ -55,8 +55,8 @@ GUIDES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((RO
 
 
 def marked(path):
-    """Returns the parameter of a test of a guide; the one that starts a cluster is marked."""
-    return pytest.param(path, id=path.name, marks=[pytest.mark.cluster] if path.name == "cluster.md" else [])
+    """Returns the parameter of a test of a guide; those that need Ray start a cluster."""
+    return pytest.param(path, id=path.name, marks=[pytest.mark.cluster] if "ray" in NEEDS.get(path.name, []) else [])
 
 
 @pytest.mark.parametrize("path", [marked(path) for path in GUIDES])

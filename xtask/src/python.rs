@@ -70,7 +70,7 @@ pub(crate) fn run(release: bool) -> Result<bool> {
         command.env("EPIPOLE_FIXTURES", root().join("fixtures")).env("EPIPOLE_PROGRAM", &program).current_dir(&folder);
         command
     };
-    // The processes of a cluster mostly wait for each other: its tests take no longer beside the others.
+    // The processes of a cluster mostly wait for each other: the others use the processors meanwhile.
     let cluster = tests("cluster").stdout(Stdio::piped()).spawn().context("pytest")?;
     let others = tests("not cluster").status().context("pytest")?;
     let cluster = cluster.wait_with_output().context("pytest")?;
