@@ -1,6 +1,6 @@
 //! Vertical disparity at matched pixels: block matching up and down, in the column of the disparity.
 
-use cv_core::{Correspondence, ImageView, Point2};
+use cv_core::{Correspondence, Image, ImageView, Point2};
 use cv_stereo::{DisparityMap, Intensity, PixelState};
 
 /// Number of cells across and down; one pixel is sampled in each.
@@ -12,6 +12,8 @@ const SEARCH_RADIUS: usize = 3;
 /// Size of a block in px.
 const WIDTH: usize = 2 * BLOCK_RADIUS.0 + 1;
 const HEIGHT: usize = 2 * BLOCK_RADIUS.1 + 1;
+/// Gray levels of 0 to 65535.
+type Gray16 = Image<u16, 1>;
 type Block = [[f32; WIDTH]; HEIGHT];
 /// Horizontal search radius in px.
 const HORIZONTAL_RADIUS: usize = 2;
@@ -34,6 +36,20 @@ pub(crate) fn vertical_matches<T: Intensity, const C: usize>(
     right: ImageView<'_, T, C>,
     map: &DisparityMap,
 ) -> Vec<Correspondence> {
+    gray_matches(&gray_levels(left), &gray_levels(right), map)
+}
+
+/// Converts an image to gray levels of 0 to 65535.
+fn gray_levels<T: Intensity, const C: usize>(view: ImageView<'_, T, C>) -> Gray16 {
+    let mut gray = Gray16::new(view.width(), view.height(), [0]);
+    for y in 0..view.height() {
+        T::gray_row(view.row(y), C, gray.row_mut(y));
+    }
+    gray
+}
+
+/// As [`vertical_matches`]. Not generic, so that it is compiled with the optimizations of this crate.
+fn gray_matches(left: &Gray16, right: &Gray16, map: &DisparityMap) -> Vec<Correspondence> {
     let (width, height) = left.size();
     // Space for a block, its gradient and the search.
     let margin = (BLOCK_RADIUS.0 + 1, BLOCK_RADIUS.1 + SEARCH_RADIUS + 1);
@@ -63,9 +79,8 @@ pub(crate) fn vertical_matches<T: Intensity, const C: usize>(
 }
 
 /// Returns the intensity of a pixel, 0 to 1.
-fn intensity<T: Intensity, const C: usize>(view: ImageView<'_, T, C>, x: usize, y: usize) -> f32 {
-    let pixel = view.at(x, y);
-    f32::from(pixel[if C >= 3 { 1 } else { 0 }].to_u16()) / 65535.0
+fn intensity(gray: &Gray16, x: usize, y: usize) -> f32 {
+    f32::from(gray.at(x, y)[0]) / 65535.0
 }
 
 /// Estimates the vertical offset of a pixel's block in the right image: minimum of the zero-mean sum of squared
@@ -73,12 +88,7 @@ fn intensity<T: Intensity, const C: usize>(view: ImageView<'_, T, C>, x: usize, 
 /// Baker & Matthews, "Lucas-Kanade 20 years on", IJCV 2004). Horizontal steps are needed since along an oblique edge
 /// the disparity has compensated for the offset. `None` for an oblique edge (aperture problem), outside the search
 /// range, or at the image border.
-fn block_offset<T: Intensity, const C: usize>(
-    left: ImageView<'_, T, C>,
-    right: ImageView<'_, T, C>,
-    (x, y): (usize, usize),
-    disparity: f32,
-) -> Option<f64> {
+fn block_offset(left: &Gray16, right: &Gray16, (x, y): (usize, usize), disparity: f32) -> Option<f64> {
     let column = x as f32 - disparity;
     let first = column.floor() as i64 - (BLOCK_RADIUS.0 + HORIZONTAL_RADIUS) as i64;
     if first < 0 || first as usize + REGION.0 > right.width() {

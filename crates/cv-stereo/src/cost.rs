@@ -2,7 +2,7 @@
 
 use crate::StereoOptions;
 use crate::border_mask::{PairMasks, RowMasks};
-use crate::coarse_prior::Prior;
+use crate::coarse_prior::{PRIOR_CAP, Prior};
 use crate::layout::{BLOCK, Layout, MAX_VECTORS, place};
 use crate::winner::outside_cost;
 use fearless_simd::prelude::*;
@@ -103,52 +103,33 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
     let row = &frame.right[y * planes * n * phase..][..planes * n * phase];
     let out = &mut out[..count * groups * group];
     let here = |p: usize| &left[p * width + xs.start..][..count];
-    // Pixels `n` apart have their candidates in the same phases, one element further.
+    // Pixels `n` apart have their candidates in the same phases, one element further: one vector of all of them at a time, so that the loop
+    // reads few slices.
     for class in 0..n.min(count) {
-        let start = width - xs.end + class;
         let steps = (count - class).div_ceil(n);
-        let reach = steps - 1 + groups * lanes;
-        let mut candidates = [[&row[..0]; BITS]; MAX_VECTORS];
-        let mut described = [&row[..0]; BITS];
-        for p in 0..BITS {
-            for v in 0..n {
-                candidates[v][p] = &row[((start + v) % n * planes + p) * phase + (start + v) / n..][..reach];
-            }
-            described[p] = here(p);
-        }
-        for step in 0..steps {
-            let pixel = count - 1 - class - step * n;
-            let out = &mut out[pixel * groups * group..][..groups * group];
-            let mut bits = [S::u8s::splat(simd, 0); BITS];
-            for p in 0..BITS {
-                bits[p] = S::u8s::splat(simd, described[p][pixel]);
-            }
+        for v in 0..n {
+            let start = width - xs.end + class + v;
+            let (of, first) = (start % n, start / n);
             for g in 0..groups {
-                // Candidates of the same vector in later groups are contiguous.
-                let at = step + g * lanes;
-                for v in 0..n {
-                    let mut differing = S::u8s::splat(simd, 0);
+                let to = (g * n + v) * lanes;
+                let candidates = |p: usize| &row[(of * planes + p) * phase + first + g * lanes..][..steps - 1 + lanes];
+                let bits: [&[u8]; BITS] = std::array::from_fn(candidates);
+                let described: [&[u8]; BITS] = std::array::from_fn(here);
+                let intensity = frame.intensity_cap.map(|cap| (S::u8s::splat(simd, cap), candidates(BITS), here(BITS)));
+                for step in 0..steps {
+                    let pixel = count - 1 - class - step * n;
+                    let mut cost = S::u8s::splat(simd, 0);
                     for p in 0..BITS {
-                        let candidate = S::u8s::from_slice(simd, &candidates[v][p][at..][..lanes]);
-                        differing += (candidate ^ bits[p]).count_ones();
+                        let candidate = S::u8s::from_slice(simd, &bits[p][step..][..lanes]);
+                        cost += (candidate ^ S::u8s::splat(simd, described[p][pixel])).count_ones();
                     }
-                    differing.store_slice(&mut out[(g * n + v) * lanes..][..lanes]);
+                    if let Some((cap, candidates, here)) = intensity {
+                        let candidate = S::u8s::from_slice(simd, &candidates[step..][..lanes]);
+                        let value = S::u8s::splat(simd, here[pixel]);
+                        cost += (value.max(candidate) - value.min(candidate)).min(cap);
+                    }
+                    cost.store_slice(&mut out[pixel * groups * group + to..][..lanes]);
                 }
-            }
-        }
-    }
-    if let Some(cap) = frame.intensity_cap {
-        let cap = S::u8s::splat(simd, cap);
-        let plane = here(BITS);
-        for (pixel, out) in out.chunks_exact_mut(groups * group).enumerate() {
-            let value = S::u8s::splat(simd, plane[pixel]);
-            for (at, out) in out.chunks_exact_mut(lanes).enumerate() {
-                let (g, v) = (at / n, at % n);
-                let start = width - 1 - (xs.start + pixel) + v;
-                let other = &row[(start % n * planes + BITS) * phase + start / n + g * lanes..][..lanes];
-                let other = S::u8s::from_slice(simd, other);
-                let more = (value.max(other) - value.min(other)).min(cap);
-                (S::u8s::from_slice(simd, out) + more).store_slice(out);
             }
         }
     }
@@ -235,25 +216,50 @@ fn set_masked_costs(frame: &Frame<'_>, masks: &RowMasks<'_>, x: usize, out: &mut
     }
 }
 
+/// Index of distance 0 in [`PRIOR_COSTS`]: the largest group, and [`PRIOR_MARGIN`].
+const PRIOR_CENTER: i32 = 2 * BLOCK as i32 + PRIOR_MARGIN;
+/// Distance outside a group from which on a prior costs its cap at all indices of the group.
+const PRIOR_MARGIN: i32 = 8;
+/// Number of distances, rounded up to a multiple of [`MAX_VECTORS`].
+const PRIOR_DISTANCES: usize = 288;
+
+/// Costs of a prior by the distance from it, for groups of 1, 2, 4 and 8 vectors and each cap: distances are split into the phases of
+/// [`Layout`], so that those of a vector are contiguous.
+const PRIOR_COSTS: [[[u8; PRIOR_DISTANCES]; PRIOR_CAP as usize]; MAX_VECTORS.ilog2() as usize + 1] = {
+    let mut costs = [[[0; PRIOR_DISTANCES]; PRIOR_CAP as usize]; MAX_VECTORS.ilog2() as usize + 1];
+    let mut log = 0;
+    while log < costs.len() {
+        let vectors = 1 << log;
+        let mut cap = 1;
+        while cap <= PRIOR_CAP as usize {
+            let mut i = 0;
+            while i < PRIOR_DISTANCES {
+                let distance = i.abs_diff(PRIOR_CENTER as usize).saturating_sub(1);
+                costs[log][cap - 1][i % vectors * (PRIOR_DISTANCES / vectors) + i / vectors] =
+                    if distance < cap { distance as u8 } else { cap as u8 };
+                i += 1;
+            }
+            cap += 1;
+        }
+        log += 1;
+    }
+    costs
+};
+
 /// Adds the cost of the distance from the prior of a pixel.
 #[inline(always)]
 fn add_prior<S: Simd, const BLOCKS: usize>(simd: S, prior: Prior, out: &mut [u8]) {
     let lanes = S::u8s::LEN;
     let group = BLOCKS * BLOCK;
     let n = group / lanes;
-    let first = S::u8s::from_fn(simd, |lane| (lane * n) as u8);
-    let (cap, one) = (S::u8s::splat(simd, prior.cap()), S::u8s::splat(simd, 1));
+    let costs = &PRIOR_COSTS[n.ilog2() as usize][usize::from(prior.cap()) - 1];
     for (g, out) in out.chunks_exact_mut(group).enumerate() {
-        // Groups have at most 128 indices: outside its own group, a prior is only required to be farther than the cap.
         let local = i32::from(prior.index()) - (g * group) as i32;
-        let (at, beyond) = (local.clamp(0, 255) as u8, (-local).clamp(0, 127) as u8);
-        let (at, beyond) = (S::u8s::splat(simd, at), S::u8s::splat(simd, beyond));
-        for v in 0..n {
-            let k = first + v as u8;
-            let distance = (k.max(at) - k.min(at)) + beyond;
-            let distance = distance - distance.min(one);
-            let out = &mut out[v * lanes..][..lanes];
-            (S::u8s::from_slice(simd, out) + distance.min(cap)).store_slice(out);
+        let first = (PRIOR_CENTER - local.clamp(-PRIOR_MARGIN, group as i32 + PRIOR_MARGIN)) as usize;
+        for (v, out) in out.chunks_exact_mut(lanes).enumerate() {
+            let at = first + v;
+            let costs = &costs[at % n * (PRIOR_DISTANCES / n) + at / n..][..lanes];
+            (S::u8s::from_slice(simd, out) + S::u8s::from_slice(simd, costs)).store_slice(out);
         }
     }
 }

@@ -23,6 +23,9 @@ const BAND: usize = 64;
 /// 0.62 % above 2 px; 1 leaves 1.78 and 0.68, 1.5 leaves 1.64 and 0.65, 3 leaves 1.68 and 0.60.
 const MAX_STEP: f32 = 2.0;
 
+/// Value of unknown disparities in the planes of the bilateral filter: farther than [`MAX_STEP`] from every disparity.
+const UNKNOWN: f32 = 1e9;
+
 /// Buffers of [`smooth`], reused between frames: those of each thread.
 #[derive(Debug, Default)]
 pub(crate) struct SmoothingBuffers(Vec<Planes>);
@@ -30,13 +33,13 @@ pub(crate) struct SmoothingBuffers(Vec<Planes>);
 /// Padded rows, and rows of zeros above and below.
 #[derive(Debug, Default)]
 struct Planes {
-    /// Disparity, 0 where unknown.
+    /// Disparity; where unknown, [`UNKNOWN`], or 0 for the fast global smoother.
     disparity: Vec<f32>,
     /// With depth discontinuities moved to image edges.
     moved: Vec<f32>,
-    /// Gray levels 0 to 255.
+    /// Gray levels, scaled.
     gray: Vec<f32>,
-    /// 1, or 0 where the disparity is unknown.
+    /// Of the fast global smoother: 1, or 0 where the disparity is unknown.
     weight: Vec<f32>,
     /// Averages of a row.
     averages: Vec<f32>,
@@ -44,13 +47,14 @@ struct Planes {
 
 /// Returns the bytes of the buffers of [`smooth`].
 pub(crate) fn bytes(smoothing: Smoothing, width: usize, height: usize) -> usize {
-    let row = 4 * size_of::<f32>() * width.saturating_add(LEFT + RIGHT);
+    let row = size_of::<f32>() * width.saturating_add(LEFT + RIGHT);
     let rows = match smoothing {
         Smoothing::None => 0,
         Smoothing::Bilateral { .. } => {
-            rayon::current_num_threads().min(height.div_ceil(BAND)).saturating_mul(BAND.min(height) + 4 * RADIUS)
+            let bands = rayon::current_num_threads().min(height.div_ceil(BAND));
+            3 * bands.saturating_mul(BAND.min(height) + 4 * RADIUS)
         }
-        Smoothing::LeastSquares { .. } => height.saturating_add(2 * RADIUS),
+        Smoothing::LeastSquares { .. } => height.saturating_add(2 * RADIUS).saturating_mul(4),
     };
     row.saturating_mul(rows)
 }
@@ -83,17 +87,18 @@ pub(crate) fn smooth(
                 let first = band * BAND;
                 let count = out.len() / width;
                 // Row `r` of the planes is row `first − 2·RADIUS + r` of the image.
-                planes.fill(level, source, gray, width, first as isize - 2 * RADIUS as isize, count + 4 * RADIUS);
-                let Planes { disparity: before, moved, gray, weight, averages } = planes;
-                let [before, gray, weight] = [before, gray, weight].map(|plane| plane.as_slice());
+                let from = first as isize - 2 * RADIUS as isize;
+                planes.fill(level, source, gray, width, (from, count + 4 * RADIUS), (UNKNOWN, 1.0 / sigma));
+                let Planes { disparity: before, moved, gray, averages, .. } = planes;
+                let [before, gray] = [before, gray].map(|plane| plane.as_slice());
                 for y in first.saturating_sub(RADIUS)..(first + count + RADIUS).min(height) {
                     let y = y + RADIUS - first;
-                    let rows = Rows { disparity: before, gray, weight, stride, y, scale: 1.0 / sigma };
+                    let rows = Rows { disparity: before, gray, stride, y };
                     let out = &mut moved[(y + RADIUS) * stride + LEFT..][..width.next_multiple_of(16)];
                     dispatch!(level, simd => move_discontinuities(simd, rows, out));
                 }
                 for (y, (out, states)) in out.chunks_exact_mut(width).zip(states.chunks_exact_mut(width)).enumerate() {
-                    let rows = Rows { disparity: moved, gray, weight, stride, y: y + RADIUS, scale: 1.0 / sigma };
+                    let rows = Rows { disparity: moved, gray, stride, y: y + RADIUS };
                     averages.resize(width.next_multiple_of(16), 0.0);
                     dispatch!(level, simd => average(simd, rows, averages));
                     let pixels = rows.at(0, RADIUS, RADIUS);
@@ -113,7 +118,8 @@ pub(crate) fn smooth(
         Smoothing::LeastSquares { lambda, sigma } => {
             buffers.resize_with(1, Planes::default);
             let planes = &mut buffers[0];
-            planes.fill(level, source, gray, width, -(RADIUS as isize), height + 2 * RADIUS);
+            planes.fill(level, source, gray, width, (-(RADIUS as isize), height + 2 * RADIUS), (0.0, 1.0));
+            planes.weigh(source, width);
             least_squares(planes, width, height, lambda, sigma, stage)?;
             disparity.par_chunks_mut(width).enumerate().for_each(|(y, out)| {
                 let from = (RADIUS + y) * stride + LEFT;
@@ -129,45 +135,61 @@ pub(crate) fn smooth(
 }
 
 impl Planes {
-    /// Copies `count` rows of the image from row `first` on; zeros outside the image.
-    fn fill(&mut self, level: Level, disparity: &[f32], gray: &[u8], width: usize, first: isize, count: usize) {
+    /// Copies `count` rows of the image from row `first` on, gray levels times `scale`; disparities outside the image are `unknown`.
+    fn fill(
+        &mut self,
+        level: Level,
+        disparity: &[f32],
+        gray: &[u8],
+        width: usize,
+        (first, count): (isize, usize),
+        (unknown, scale): (f32, f32),
+    ) {
         let stride = width + LEFT + RIGHT;
-        for plane in [&mut self.disparity, &mut self.moved, &mut self.gray, &mut self.weight] {
+        for plane in [&mut self.disparity, &mut self.moved, &mut self.gray] {
             plane.resize(stride * count, 0.0);
         }
         let planes = self.disparity.par_chunks_mut(stride).zip(self.moved.par_chunks_mut(stride));
-        let planes = planes.zip(self.gray.par_chunks_mut(stride)).zip(self.weight.par_chunks_mut(stride));
-        planes.with_min_len(BAND).enumerate().for_each(|(row, (((d, m), g), w))| {
+        let planes = planes.zip(self.gray.par_chunks_mut(stride));
+        planes.with_min_len(BAND).enumerate().for_each(|(row, ((d, m), g))| {
             let start = usize::try_from(first + row as isize).unwrap_or(usize::MAX).saturating_mul(width);
             if start >= disparity.len() {
-                for row in [d, m, g, w] {
-                    row.fill(0.0);
-                }
+                d.fill(unknown);
+                m.fill(unknown);
                 return;
             }
-            let inside = LEFT..LEFT + width;
-            let out = [&mut d[inside.clone()], &mut g[inside.clone()], &mut w[inside]];
-            let pixels = start..start + width;
-            dispatch!(level, simd => fill_row(simd, out, &disparity[pixels.clone()], &gray[pixels]));
-            for row in [d, m, g, w] {
-                row[..LEFT].fill(0.0);
-                row[LEFT + width..].fill(0.0);
+            let (inside, pixels) = (LEFT..LEFT + width, start..start + width);
+            let out = [&mut d[inside.clone()], &mut g[inside]];
+            dispatch!(level, simd => fill_row(simd, out, &disparity[pixels.clone()], &gray[pixels], unknown, scale));
+            for row in [d, m] {
+                row[..LEFT].fill(unknown);
+                row[LEFT + width..].fill(unknown);
+            }
+        });
+    }
+
+    /// Sets the weights of all rows.
+    fn weigh(&mut self, disparity: &[f32], width: usize) {
+        let stride = width + LEFT + RIGHT;
+        self.weight.clear();
+        self.weight.resize(self.disparity.len(), 0.0);
+        let rows = self.weight.par_chunks_mut(stride).skip(RADIUS).zip(disparity.par_chunks(width));
+        rows.for_each(|(weight, disparity)| {
+            for (weight, d) in weight[LEFT..].iter_mut().zip(disparity) {
+                *weight = if d.is_nan() { 0.0 } else { 1.0 };
             }
         });
     }
 }
 
-/// Copies disparities, gray levels and weights of a row, without padding.
+/// Copies disparities and gray levels of a row, without padding.
 #[simd]
-fn fill_row<S: Simd>(_: S, [d, g, w]: [&mut [f32]; 3], disparity: &[f32], gray: &[u8]) {
+fn fill_row<S: Simd>(_: S, [d, g]: [&mut [f32]; 2], disparity: &[f32], gray: &[u8], unknown: f32, scale: f32) {
     for (out, &value) in d.iter_mut().zip(disparity) {
-        *out = if value.is_nan() { 0.0 } else { value };
+        *out = if value.is_nan() { unknown } else { value };
     }
     for (out, &value) in g.iter_mut().zip(gray) {
-        *out = f32::from(value);
-    }
-    for (out, &value) in w.iter_mut().zip(disparity) {
-        *out = if value.is_nan() { 0.0 } else { 1.0 };
+        *out = f32::from(value) * scale;
     }
 }
 
@@ -175,12 +197,10 @@ fn fill_row<S: Simd>(_: S, [d, g, w]: [&mut [f32]; 3], disparity: &[f32], gray: 
 #[derive(Clone, Copy)]
 struct Rows<'a> {
     disparity: &'a [f32],
+    /// Times the decrease of the weight per gray level of difference.
     gray: &'a [f32],
-    weight: &'a [f32],
     stride: usize,
     y: usize,
-    /// Decrease of the weight per gray level of difference.
-    scale: f32,
 }
 
 impl Rows<'_> {
@@ -197,18 +217,18 @@ impl Rows<'_> {
 fn move_discontinuities<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
     let lanes = S::f32s::LEN;
     let load = |plane: &[f32], at: usize| S::f32s::from_slice(simd, &plane[at..at + lanes]);
-    let zero = S::f32s::splat(simd, 0.0);
+    let (zero, limit) = (S::f32s::splat(simd, 0.0), S::f32s::splat(simd, 0.5 * UNKNOWN));
     for x in (0..out.len()).step_by(lanes) {
         let center = rows.at(x, RADIUS, RADIUS);
         let here = load(rows.disparity, center);
         let (mut low, mut high) = (here, here);
         for (dx, dy) in [(2, 4), (3, 4), (5, 4), (6, 4), (4, 2), (4, 3), (4, 5), (4, 6)] {
-            let at = rows.at(x, dx, dy);
-            let value = load(rows.weight, at).simd_gt(zero).select(load(rows.disparity, at), here);
+            let value = load(rows.disparity, rows.at(x, dx, dy));
+            let value = value.simd_lt(limit).select(value, here);
             low = low.min(value);
             high = high.max(value);
         }
-        let step = (high - low).simd_gt(S::f32s::splat(simd, MAX_STEP));
+        let step = (high - low).simd_gt(S::f32s::splat(simd, MAX_STEP)) & here.simd_lt(limit);
         let mut result = here;
         if step.any_true() {
             let middle = (low + high) * 0.5;
@@ -218,8 +238,8 @@ fn move_discontinuities<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
                 for dx in (0..=2 * RADIUS).step_by(SPACING) {
                     let at = rows.at(x, dx, dy);
                     let value = load(rows.disparity, at);
-                    let alike = (S::f32s::splat(simd, 1.0) - (load(rows.gray, at) - gray).abs() * rows.scale).max(zero);
-                    let weight = alike * load(rows.weight, at);
+                    let alike = (S::f32s::splat(simd, 1.0) - (load(rows.gray, at) - gray).abs()).max(zero);
+                    let weight = value.simd_lt(limit).select(alike, zero);
                     let nearer = value.simd_gt(middle).select(weight, zero);
                     all += weight;
                     all_sum += weight * value;
@@ -254,9 +274,8 @@ fn average<S: Simd>(simd: S, rows: Rows<'_>, out: &mut [f32]) {
             for dx in (0..=2 * RADIUS).step_by(SPACING) {
                 let at = rows.at(x, dx, dy);
                 let off = load(rows.disparity, at) - here;
-                let alike = (S::f32s::splat(simd, 1.0) - (load(rows.gray, at) - gray).abs() * rows.scale).max(zero);
-                let weight =
-                    off.abs().simd_le(S::f32s::splat(simd, MAX_STEP)).select(alike * load(rows.weight, at), zero);
+                let alike = (S::f32s::splat(simd, 1.0) - (load(rows.gray, at) - gray).abs()).max(zero);
+                let weight = off.abs().simd_le(S::f32s::splat(simd, MAX_STEP)).select(alike, zero);
                 all += weight;
                 sum += weight * off;
             }
@@ -356,7 +375,8 @@ mod tests {
         };
         let weight = |i: usize, j: usize| {
             let known = if d[j].is_nan() { 0.0 } else { 1.0 };
-            (1.0 - f32::from(gray[i].abs_diff(gray[j])) * (1.0 / sigma)).max(0.0) * known
+            let [a, b] = [gray[i], gray[j]].map(|gray| f32::from(gray) * (1.0 / sigma));
+            (1.0 - (b - a).abs()).max(0.0) * known
         };
         let around = |i: usize| {
             let (x, y) = ((i % width) as i64, (i / width) as i64);

@@ -157,7 +157,7 @@ impl StereoMatcher {
         progress.report("bits", 0, 1)?;
         self.reclaim_gray();
         for (side, view, gray) in [("left", left, 0), ("right", right, 1)] {
-            let count = to_gray(self.level, view, &mut self.gray[gray]);
+            let count = to_gray(view, &mut self.gray[gray]);
             if count > 0 {
                 return Err(StereoError::NotFinite { side, count });
             }
