@@ -37,6 +37,7 @@ mod input;
 mod kernel;
 mod layout;
 mod local_expansion;
+mod local_planes;
 mod matcher;
 mod matcher_memory;
 mod median;

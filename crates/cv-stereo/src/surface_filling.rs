@@ -109,6 +109,7 @@ pub(crate) fn fill(
     project_matches(disparity, states, width, pair.masks, right);
     surfaces.smooth_low_texture(disparity, width);
     stage.check()?;
+    surfaces.add_local_planes();
     let view = View { pair, right, disparity, states, columns: RightColumns::new(&pair) };
     open.clear();
     open.extend((0..surfaces.cells.len() as u32).filter(|&c| surfaces.labels[c as usize] == NONE));
@@ -293,6 +294,20 @@ impl View<'_> {
         0.5 + texture * (((bits ^ there).count_ones() as f32 / chance).min(1.0) - 0.5)
     }
 
+    /// Returns the plane of a surface in a cell: the local one where it is out of view or occluded.
+    #[inline(always)]
+    fn plane<'a>(&self, surfaces: &'a Surfaces, label: u32, c: usize) -> &'a Plane {
+        let width = self.pair.width;
+        let local = &surfaces.local_planes[label as usize];
+        let (x, y) = center(c, surfaces.columns);
+        let d = local.at(x, y);
+        let (x, y) = ((x as usize).min(width - 1), (y as usize).min(self.height() - 1));
+        match unmatched_state(x, d, &self.right[y * width..][..width]) {
+            PixelState::OutOfView | PixelState::Occluded => local,
+            _ => &surfaces.planes[label as usize],
+        }
+    }
+
     /// Returns the data term of a plane in a cell, from every `step`-th pixel of every `step`-th row.
     fn cell_cost(&self, surfaces: &Surfaces, c: usize, plane: &Plane, step: usize) -> f32 {
         let width = self.pair.width;
@@ -340,8 +355,8 @@ fn propagate_labels(
     let scales: Vec<[f32; 2]> = surfaces.sizes.iter().map(|&size| distance_scales(size)).collect();
     // In 1/1024 of a cell, as integers, so that ties are broken deterministically.
     let visit = |surfaces: &Surfaces, heap: &mut BinaryHeap<_>, c: usize, so_far: u64, label: u32| {
-        let plane = &surfaces.planes[label as usize];
         for n in neighbors(c, columns, rows).into_iter().flatten().filter(|&n| surfaces.labels[n] == NONE) {
+            let plane = view.plane(surfaces, label, n);
             let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs() / EDGE_GRAY;
             let cost = view.cell_cost(surfaces, n, plane, 4);
             let (x, y) = center(n, columns);
@@ -390,16 +405,18 @@ fn update_label(surfaces: &mut Surfaces, view: View<'_>, c: usize) {
     let (x, y) = center(c, columns);
     let half = 0.5 * CELL as f64;
     let borders = [(x - half, y), (x + half, y), (x, y - half), (x, y + half)];
+    // The disparities of the neighbors at the borders, and the weights of the smoothness term.
+    let others = neighbors(c, columns, rows).map(|n| n.filter(|&n| surfaces.labels[n] != NONE));
+    let others: [Option<(f32, f32)>; 4] = std::array::from_fn(|i| {
+        let (n, (x, y)) = (others[i]?, borders[i]);
+        let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs();
+        Some((view.plane(surfaces, surfaces.labels[n], n).at(x, y), SMOOTHNESS * EDGE_GRAY / (EDGE_GRAY + edge)))
+    });
     let cost = |label: u32| {
-        let plane = &surfaces.planes[label as usize];
+        let plane = view.plane(surfaces, label, c);
         let mut cost = view.cell_cost(surfaces, c, plane, 2);
-        for (n, (x, y)) in neighbors(c, columns, rows).into_iter().zip(borders) {
-            let Some((n, other)) = n.and_then(|n| Some((n, surfaces.planes.get(surfaces.labels[n] as usize)?))) else {
-                continue;
-            };
-            let distance = (plane.at(x, y) - other.at(x, y)).abs();
-            let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs();
-            cost += SMOOTHNESS * EDGE_GRAY / (EDGE_GRAY + edge) * (distance / MAX_DISTANCE).min(1.0);
+        for ((x, y), (other, weight)) in borders.iter().zip(others).filter_map(|(at, other)| Some((*at, other?))) {
+            cost += weight * ((plane.at(x, y) - other).abs() / MAX_DISTANCE).min(1.0);
         }
         cost
     };
@@ -436,20 +453,19 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
     let (xs, ys) = extent(c, columns, (width, height));
     // Surfaces that are the same at the corners of the cell are merged.
     let corners = [(xs.start, ys.start), (xs.end - 1, ys.start), (xs.start, ys.end - 1), (xs.end - 1, ys.end - 1)];
-    let (mut different, mut here, mut places) = ([0; 9], [[0f32; 4]; 9], [0; 9]);
+    let (mut different, mut here, mut places) = ([None; 9], [[0f32; 4]; 9], [0; 9]);
     let mut n = 0;
     for (place, &label) in places.iter_mut().zip(&around[..count]) {
-        let plane = &surfaces.planes[label as usize];
+        let plane = view.plane(surfaces, label, c);
         let at = corners.map(|(x, y)| plane.at(x as f64, y as f64));
         let is_same = |other: &[f32; 4]| at.iter().zip(other).all(|(a, b)| (a - b).abs() < SAME_PLANE);
         *place = here[..n].iter().position(is_same).unwrap_or(n);
         if *place == n {
-            (different[n], here[n]) = (label as usize, at);
+            (different[n], here[n]) = (Some(*plane), at);
             n += 1;
         }
     }
-    if n == 1 {
-        let plane = surfaces.planes[different[0]];
+    if let (1, Some(plane)) = (n, different[0]) {
         for y in ys {
             for (x, d) in xs.clone().zip(&view.disparity[y * width..][xs.clone()]) {
                 if d.is_nan() {
@@ -473,7 +489,8 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
             }
         }
     }
-    let planes: [Plane; 9] = different.map(|label| surfaces.planes[label]);
+    // Of a visible pixel without a differing census bit; surfaces that cannot be the best are skipped.
+    let least_cost = OCCLUDED_COST.min(0.5 - 0.5 * texture);
     for y in ys {
         for x in xs.clone() {
             if !view.disparity[y * width + x].is_nan() {
@@ -485,9 +502,13 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
                 gray_difference[place] = gray_difference[place].min((gray - of_cell).abs());
             }
             let mut best = (f32::INFINITY, f32::NAN);
-            for (plane, difference) in planes[..n].iter().zip(gray_difference) {
+            for (plane, difference) in different.iter().flatten().zip(gray_difference) {
+                let so_far = difference / MAX_GRAY_DIFFERENCE;
+                if so_far + DATA_WEIGHT * least_cost > best.0 {
+                    continue;
+                }
                 let d = plane.at(x as f64, y as f64);
-                let cost = difference / MAX_GRAY_DIFFERENCE + DATA_WEIGHT * view.cost(x, y, d, texture, bits);
+                let cost = so_far + DATA_WEIGHT * view.cost(x, y, d, texture, bits);
                 // Of equal costs the farther one.
                 if cost < best.0 || (cost == best.0 && d < best.1) {
                     best = (cost, d);

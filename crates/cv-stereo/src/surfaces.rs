@@ -57,8 +57,52 @@ impl Moments {
         self.join(&one);
     }
 
+    /// Computes the moments of the pixels of a cell with disparities from `low` to `high`, relative to its center.
+    ///
+    /// Columns are summed in single precision, relative to the lowest disparity: accurate to 1e-5 px.
+    #[inline(always)]
+    fn of_cell(pixels: &[[f32; CELL]; CELL], (low, high): (f32, f32)) -> Self {
+        let middle = 0.5 * (CELL - 1) as f32;
+        let [mut n, mut y1, mut y2, mut d1, mut yd, mut d2] = [[0f32; CELL]; 6];
+        for (row, pixels) in pixels.iter().enumerate() {
+            let y = row as f32 - middle;
+            for x in 0..CELL {
+                let d = pixels[x];
+                // NaN compares false.
+                let is_in = (d >= low) & (d <= high);
+                let (weight, off) = (if is_in { 1.0 } else { 0.0 }, if is_in { d - low } else { 0.0 });
+                n[x] += weight;
+                y1[x] += weight * y;
+                y2[x] += weight * (y * y);
+                d1[x] += off;
+                yd[x] += off * y;
+                d2[x] += off * off;
+            }
+        }
+        let mut all = Self::default();
+        for i in 0..CELL {
+            let x = f64::from(i as f32 - middle);
+            let [n, y1, y2, d1, yd, d2] = [n[i], y1[i], y2[i], d1[i], yd[i], d2[i]].map(f64::from);
+            let low = if n > 0.0 { f64::from(low) } else { 0.0 };
+            let d = d1 + n * low;
+            all.join(&Self {
+                n,
+                x: x * n,
+                y: y1,
+                xx: x * x * n,
+                xy: x * y1,
+                yy: y2,
+                d,
+                xd: x * d,
+                yd: yd + y1 * low,
+                dd: d2 + 2.0 * low * d1 + n * low * low,
+            });
+        }
+        all
+    }
+
     /// Returns the moments relative to a point at `(-dx, -dy)` from the current one.
-    fn shifted(&self, dx: f64, dy: f64) -> Self {
+    pub(crate) fn shifted(&self, dx: f64, dy: f64) -> Self {
         Self {
             n: self.n,
             x: self.x + dx * self.n,
@@ -74,7 +118,7 @@ impl Moments {
     }
 
     /// Adds moments relative to the same point.
-    fn join(&mut self, other: &Self) {
+    pub(crate) fn join(&mut self, other: &Self) {
         self.n += other.n;
         self.x += other.x;
         self.y += other.y;
@@ -117,7 +161,7 @@ impl Moments {
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Cell {
     /// Moments of the matched pixels of its larger surface, relative to its center.
-    moments: Moments,
+    pub(crate) moments: Moments,
     /// Minimum and maximum of their disparities.
     range: (f32, f32),
     /// Mean gray level.
@@ -131,9 +175,9 @@ pub(crate) struct Cell {
 /// A plane, clamped to a range of disparities.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Plane {
-    origin: (f64, f64),
-    coefficients: [f64; 3],
-    range: (f64, f64),
+    pub(crate) origin: (f64, f64),
+    pub(crate) coefficients: [f64; 3],
+    pub(crate) range: (f64, f64),
 }
 
 impl Plane {
@@ -153,6 +197,8 @@ pub(crate) struct Surfaces {
     /// The surface of each cell, or [`NONE`].
     pub(crate) labels: Vec<u32>,
     pub(crate) planes: Vec<Plane>,
+    /// The plane by which each is extrapolated: see [`crate::local_planes`].
+    pub(crate) local_planes: Vec<Plane>,
     /// Number of cells of each surface.
     pub(crate) sizes: Vec<usize>,
     order: Vec<(u64, u32)>,
@@ -174,7 +220,7 @@ pub(crate) fn extent(cell: usize, columns: usize, (width, height): (usize, usize
 impl Surfaces {
     /// Returns the bytes for images of this size.
     pub(crate) fn bytes(width: usize, height: usize) -> usize {
-        let cell = size_of::<Cell>() + 2 * size_of::<u32>() + size_of::<Plane>() + size_of::<usize>() + 16;
+        let cell = size_of::<Cell>() + 2 * size_of::<u32>() + 2 * size_of::<Plane>() + size_of::<usize>() + 16;
         width.div_ceil(CELL).saturating_mul(height.div_ceil(CELL)).saturating_mul(cell)
     }
 
@@ -195,7 +241,7 @@ impl Surfaces {
     }
 
     /// Returns how textureless a cell is, 0 to 1.
-    fn texturelessness(&self, cell: usize) -> f64 {
+    pub(crate) fn texturelessness(&self, cell: usize) -> f64 {
         f64::from(((TEXTURE_RANGE.0 - self.cells[cell].texture) / (TEXTURE_RANGE.0 - TEXTURE_RANGE.1)).clamp(0.0, 1.0))
     }
 
@@ -367,69 +413,59 @@ impl Cell {
     fn new(disparity: &[f32], gray: &[u8], (width, height): (usize, usize), (column, row): (usize, usize)) -> Self {
         let (left, top) = (column * CELL, row * CELL);
         let (right, bottom) = ((left + CELL).min(width), (top + CELL).min(height));
-        let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
-        let (mut sum, mut steps, mut holes) = (0, 0, 0);
-        for y in top..bottom {
-            let row = y * width..(y + 1) * width;
-            for &d in &disparity[row.clone()][left..right] {
-                holes += u32::from(d.is_nan());
-                // NaN compares false.
-                (low, high) = (if d < low { d } else { low }, if d > high { d } else { high });
+        // NaN outside the image: loops of constant length are vectorized.
+        let mut pixels = [[f32::NAN; CELL]; CELL];
+        let (mut sum, mut steps) = (0, 0);
+        for (y, pixels) in (top..bottom).zip(&mut pixels) {
+            let gray = &gray[y * width..][..width];
+            let inside = &disparity[y * width..][left..right];
+            match (inside.first_chunk(), gray[left..].first_chunk::<{ CELL + 1 }>()) {
+                (Some(inside), Some(gray)) => {
+                    *pixels = *inside;
+                    sum += gray[..CELL].iter().map(|&g| u32::from(g)).sum::<u32>();
+                    steps += (0..CELL).map(|x| u32::from(gray[x].abs_diff(gray[x + 1]))).sum::<u32>();
+                }
+                _ => {
+                    pixels[..inside.len()].copy_from_slice(inside);
+                    sum += gray[left..right].iter().map(|&g| u32::from(g)).sum::<u32>();
+                    let next = gray[left + 1..].iter().chain(gray.last());
+                    let pairs = gray[left..right].iter().zip(next);
+                    steps += pairs.map(|(&a, &b)| u32::from(a.abs_diff(b))).sum::<u32>();
+                }
             }
-            let gray = &gray[row];
-            sum += gray[left..right].iter().map(|&g| u32::from(g)).sum::<u32>();
-            let next = gray[left + 1..].iter().chain(gray.last());
-            steps += gray[left..right].iter().zip(next).map(|(&a, &b)| u32::from(a.abs_diff(b))).sum::<u32>();
         }
+        let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
+        let (mut least, mut most, mut unknown) = ([low; CELL], [high; CELL], [0; CELL]);
+        for pixels in &pixels {
+            for x in 0..CELL {
+                // NaN compares false.
+                least[x] = if pixels[x] < least[x] { pixels[x] } else { least[x] };
+                most[x] = if pixels[x] > most[x] { pixels[x] } else { most[x] };
+                unknown[x] += u32::from(pixels[x].is_nan());
+            }
+        }
+        for x in 0..CELL {
+            (low, high) = (low.min(least[x]), high.max(most[x]));
+        }
+        let count = (right - left) * (bottom - top);
+        let holes = unknown.iter().sum::<u32>() - (CELL * CELL - count) as u32;
         // Split twice: a cell may have three surfaces.
         for _ in 0..2 {
             if high - low > MAX_CELL_RANGE {
                 let middle = 0.5 * (low + high);
                 let (mut above, mut least, mut below, mut most) = (0, high, 0, low);
-                for y in top..bottom {
-                    for &d in &disparity[y * width..][left..right] {
-                        let (up, down) = (d > middle && d <= high, d <= middle && d >= low);
-                        above += u32::from(up);
-                        below += u32::from(down);
-                        least = if up && d < least { d } else { least };
-                        most = if down && d > most { d } else { most };
-                    }
+                for &d in pixels.as_flattened() {
+                    let (up, down) = (d > middle && d <= high, d <= middle && d >= low);
+                    above += u32::from(up);
+                    below += u32::from(down);
+                    least = if up && d < least { d } else { least };
+                    most = if down && d > most { d } else { most };
                 }
                 (low, high) = if above > below { (least, high) } else { (low, most) };
             }
         }
-        let mut moments = Moments::default();
-        for y in top..bottom {
-            // Rows in single precision, relative to the lowest disparity: accurate to 1e-5 px.
-            let [mut n, mut x1, mut x2, mut d1, mut xd, mut d2] = [0f32; 6];
-            for (x, &d) in disparity[y * width..][left..right].iter().enumerate() {
-                let (x, off) = (x as f32 - 0.5 * (CELL - 1) as f32, d - low);
-                let (weight, off) = if d >= low && d <= high { (1.0, off) } else { (0.0, 0.0) };
-                n += weight;
-                x1 += weight * x;
-                x2 += weight * x * x;
-                d1 += off;
-                xd += x * off;
-                d2 += off * off;
-            }
-            let [n, x1, x2, d1, xd, d2] = [n, x1, x2, d1, xd, d2].map(f64::from);
-            let (y, low) = ((y - top) as f64 - 0.5 * (CELL - 1) as f64, f64::from(low));
-            if n > 0.0 {
-                moments.join(&Moments {
-                    n,
-                    x: x1,
-                    y: y * n,
-                    xx: x2,
-                    xy: y * x1,
-                    yy: y * y * n,
-                    d: d1 + n * low,
-                    xd: xd + low * x1,
-                    yd: y * (d1 + n * low),
-                    dd: d2 + 2.0 * low * d1 + n * low * low,
-                });
-            }
-        }
-        let count = ((right - left) * (bottom - top)) as f32;
+        let moments = Moments::of_cell(&pixels, (low, high));
+        let count = count as f32;
         Self { moments, range: (low, high), gray: sum as f32 / count, texture: steps as f32 / count, holes }
     }
 }
