@@ -78,6 +78,7 @@ pub(crate) struct Filling {
     pub(crate) right: Vec<f32>,
     /// Cells without an initial surface.
     open: Vec<u32>,
+    is_stale: Vec<bool>,
     heap: BinaryHeap<Reverse<(u64, u32, u32)>>,
     /// Of each cell.
     extrapolations: Vec<Extrapolation>,
@@ -99,7 +100,7 @@ pub(crate) fn fill(
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
     let width = pair.width;
-    let Filling { surfaces, right, open, heap, extrapolations } = filling;
+    let Filling { surfaces, right, open, is_stale, heap, extrapolations } = filling;
     extrapolations.clear();
     surfaces.segment(level, disparity, pair.gray, width, pair.min_disparity as f32);
     stage.check()?;
@@ -115,10 +116,15 @@ pub(crate) fn fill(
     open.extend((0..surfaces.cells.len() as u32).filter(|&c| surfaces.labels[c as usize] == NONE));
     extrapolations.resize(surfaces.cells.len(), Extrapolation::default());
     propagate_labels(surfaces, view, heap, extrapolations, stage)?;
+    // Cells of which a neighbor changed since they were updated.
+    is_stale.clear();
+    is_stale.resize(surfaces.cells.len(), true);
     for pass in 0..PASSES {
         for i in 0..open.len() {
             let c = open[if pass % 2 == 0 { i } else { open.len() - 1 - i }] as usize;
-            update_label(surfaces, view, c);
+            if std::mem::take(&mut is_stale[c]) && update_label(surfaces, view, c) {
+                surfaces.around(c).for_each(|n| is_stale[n] = n != c);
+            }
             if i.is_multiple_of(1024) {
                 stage.check()?;
             }
@@ -308,30 +314,44 @@ impl View<'_> {
         }
     }
 
-    /// Returns the data term of a plane in a cell, from every `step`-th pixel of every `step`-th row.
-    fn cell_cost(&self, surfaces: &Surfaces, c: usize, plane: &Plane, step: usize) -> f32 {
+    /// Returns the data terms of planes in a cell, from every `step`-th pixel of every `step`-th row.
+    #[inline(always)]
+    fn cell_costs<const N: usize>(
+        &self,
+        surfaces: &Surfaces,
+        c: usize,
+        planes: &[Option<&Plane>; N],
+        step: usize,
+    ) -> [f32; N] {
         let width = self.pair.width;
         let texture = texture_weight(surfaces, c);
-        let mut cost = 0.0;
+        let mut costs = [0.0; N];
         let (left, top) = (c % surfaces.columns * CELL, c / surfaces.columns * CELL);
         for y in (top + step / 2..(top + CELL).min(self.height())).step_by(step) {
             for x in (left + step / 2..(left + CELL).min(width)).step_by(step) {
-                let (value, i) = (plane.at(x as f64, y as f64), y * width + x);
+                let i = y * width + x;
                 let d = self.disparity[i];
                 // Weight of the sample: the number of pixels it represents.
                 let weight = (step * step) as f32;
-                if d.is_nan() {
-                    cost += 0.25 * weight * OCCLUDING_COST * self.cost(x, y, value, texture, self.bits(x, y));
-                    if !matches!(self.states[i], PixelState::OutOfView | PixelState::NoData) {
-                        let rejected = (self.pair.min_disparity + i32::from(self.pair.winners[i].index)) as f32;
-                        cost += weight * REJECTED_WEIGHT * (rejected - value).abs().min(2.0);
+                let values = planes.iter().map_while(|plane| plane.map(|plane| plane.at(x as f64, y as f64)));
+                if !d.is_nan() {
+                    for (cost, value) in costs.iter_mut().zip(values) {
+                        *cost += weight * MATCH_WEIGHT * (d - value).abs().min(2.0);
                     }
-                } else {
-                    cost += weight * MATCH_WEIGHT * (d - value).abs().min(2.0);
+                    continue;
+                }
+                let bits = self.bits(x, y);
+                let has_match = !matches!(self.states[i], PixelState::OutOfView | PixelState::NoData);
+                let rejected = (self.pair.min_disparity + i32::from(self.pair.winners[i].index)) as f32;
+                for (cost, value) in costs.iter_mut().zip(values) {
+                    *cost += 0.25 * weight * OCCLUDING_COST * self.cost(x, y, value, texture, bits);
+                    if has_match {
+                        *cost += weight * REJECTED_WEIGHT * (rejected - value).abs().min(2.0);
+                    }
                 }
             }
         }
-        cost
+        costs
     }
 }
 
@@ -358,7 +378,7 @@ fn propagate_labels(
         for n in neighbors(c, columns, rows).into_iter().flatten().filter(|&n| surfaces.labels[n] == NONE) {
             let plane = view.plane(surfaces, label, n);
             let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs() / EDGE_GRAY;
-            let cost = view.cell_cost(surfaces, n, plane, 4);
+            let [cost] = view.cell_costs(surfaces, n, &[Some(plane)], 4);
             let (x, y) = center(n, columns);
             let is_out_of_view = x < f64::from(plane.at(x, y));
             let step = scales[label as usize][usize::from(is_out_of_view)] * (1.0 + edge + PATH_COST_WEIGHT * cost);
@@ -394,11 +414,20 @@ fn distance_scales(size: usize) -> [f32; 2] {
     [scale, scale.sqrt()]
 }
 
-/// Assigns a cell the surface of its neighborhood of the lowest energy: data term and smoothness term.
-fn update_label(surfaces: &mut Surfaces, view: View<'_>, c: usize) {
+/// Assigns a cell the surface of its neighborhood of the lowest energy: data term and smoothness term. Returns whether it changes.
+fn update_label(surfaces: &mut Surfaces, view: View<'_>, c: usize) -> bool {
     let (around, count) = surfaces.labels_around(c);
-    if count < 2 {
-        return;
+    // Surfaces of one plane are one.
+    let (mut planes, mut labels, mut n) = ([None; 9], [NONE; 9], 0);
+    for &label in &around[..count] {
+        let plane = Some(view.plane(surfaces, label, c));
+        if !planes[..n].contains(&plane) {
+            (planes[n], labels[n]) = (plane, label);
+            n += 1;
+        }
+    }
+    if n < 2 {
+        return false;
     }
     let columns = surfaces.columns;
     let rows = surfaces.cells.len() / columns;
@@ -412,22 +441,20 @@ fn update_label(surfaces: &mut Surfaces, view: View<'_>, c: usize) {
         let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs();
         Some((view.plane(surfaces, surfaces.labels[n], n).at(x, y), SMOOTHNESS * EDGE_GRAY / (EDGE_GRAY + edge)))
     });
-    let cost = |label: u32| {
-        let plane = view.plane(surfaces, label, c);
-        let mut cost = view.cell_cost(surfaces, c, plane, 2);
+    let costs = view.cell_costs(surfaces, c, &planes, 2);
+    let mut best = (f32::INFINITY, surfaces.labels[c]);
+    for ((plane, label), mut cost) in planes.iter().zip(labels).zip(costs) {
+        let Some(plane) = plane else { break };
         for ((x, y), (other, weight)) in borders.iter().zip(others).filter_map(|(at, other)| Some((*at, other?))) {
             cost += weight * ((plane.at(x, y) - other).abs() / MAX_DISTANCE).min(1.0);
         }
-        cost
-    };
-    let mut best = (f32::INFINITY, surfaces.labels[c]);
-    for &label in &around[..count] {
-        let cost = cost(label);
         if cost < best.0 {
             best = (cost, label);
         }
     }
+    let is_changed = surfaces.labels[c] != best.1;
     surfaces.labels[c] = best.1;
+    is_changed
 }
 
 /// Returns the disparities of the holes of a row of cells, cell by cell.

@@ -173,7 +173,7 @@ pub(crate) struct Cell {
 }
 
 /// A plane, clamped to a range of disparities.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Plane {
     pub(crate) origin: (f64, f64),
     pub(crate) coefficients: [f64; 3],
@@ -321,6 +321,15 @@ impl Surfaces {
             self.planes.push(Plane { origin, coefficients: all.fit(), range: (range.0.min(range.1), range.1) });
             self.sizes.push(size);
         }
+    }
+
+    /// Returns a cell and its 8-neighbors.
+    pub(crate) fn around(&self, c: usize) -> impl Iterator<Item = usize> + use<> {
+        let columns = self.columns;
+        let (x, y) = (c % columns, c / columns);
+        let (xs, ys) =
+            (x.saturating_sub(1)..(x + 2).min(columns), y.saturating_sub(1)..(y + 2).min(self.cells.len() / columns));
+        ys.flat_map(move |y| xs.clone().map(move |x| y * columns + x))
     }
 
     /// Returns the distinct labels of a cell and its 8-neighbors, and their number.
