@@ -18,7 +18,7 @@ pub trait Intensity: Sample {
     /// or more channels; of two, the first is used. Returns the number of samples that are NaN or infinite.
     ///
     /// Not generic, so that it is compiled with the optimizations of this crate, whatever those of its caller: at `opt-level = "z"` it takes
-    /// forty times as long.
+    /// twelve times as long.
     fn gray_row(samples: &[Self], channels: usize, gray: &mut [u16]) -> usize;
 }
 
