@@ -59,12 +59,13 @@ impl Intensity for f32 {
 
 fn gray_row<T: Intensity>(samples: &[T], channels: usize, gray: &mut [u16]) -> usize {
     dispatch!(Level::new(), simd => match channels {
+        0 => {}
         1 => convert::<_, T, 1>(simd, samples, gray),
         2 => convert::<_, T, 2>(simd, samples, gray),
         3 => convert::<_, T, 3>(simd, samples, gray),
         4 => convert::<_, T, 4>(simd, samples, gray),
         _ => {
-            for (pixel, gray) in samples.chunks_exact(channels.max(1)).zip(gray) {
+            for (pixel, gray) in samples.chunks_exact(channels).zip(gray) {
                 *gray = luma_u16([pixel[0], pixel[1], pixel[2]].map(T::to_u16));
             }
         }
@@ -128,5 +129,18 @@ mod tests {
         let mut out = Gray::default();
         assert_eq!(to_gray(image.view(), &mut out), 2);
         assert_eq!((out.values[MARGIN], out.values[out.stride() + MARGIN + 1]), (32768, 65535));
+    }
+
+    #[test]
+    fn of_many_channels_the_first_three_are_the_color_and_none_are_no_pixels() {
+        let samples: Vec<u8> = (0..30).map(|i| i * 8).collect();
+        let rgb: Vec<u8> = samples.chunks_exact(5).flat_map(|pixel| pixel[..3].to_vec()).collect();
+        let (mut of_five, mut of_three) = ([0; 6], [0; 6]);
+        u8::gray_row(&samples, 5, &mut of_five);
+        u8::gray_row(&rgb, 3, &mut of_three);
+        assert_eq!(of_five, of_three);
+        let mut unchanged = [7; 2];
+        assert_eq!(u8::gray_row(&samples, 0, &mut unchanged), 0);
+        assert_eq!(unchanged, [7; 2]);
     }
 }
