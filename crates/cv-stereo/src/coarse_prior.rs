@@ -6,6 +6,7 @@
 //! reconstruction from imagery", 2012), which limits the search range of each pixel by the coarser level; here the range stays complete
 //! and only pixels of low texture have a prior, so that thin structures are not lost.
 
+use crate::layout::{BLOCK, MAX_VECTORS};
 use crate::options::MAX_DISPARITIES;
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
@@ -57,6 +58,36 @@ impl Prior {
         (self.0 >> INDEX_BITS) as u8
     }
 }
+
+/// Index of distance 0 in [`PRIOR_COSTS`]: the largest group, and [`PRIOR_MARGIN`].
+pub(crate) const PRIOR_CENTER: i32 = 2 * BLOCK as i32 + PRIOR_MARGIN;
+/// Distance outside a group from which on a prior costs its cap at all indices of the group.
+pub(crate) const PRIOR_MARGIN: i32 = 8;
+/// Number of distances up to the last vector of the largest group, rounded up to a multiple of [`crate::layout::MAX_VECTORS`].
+pub(crate) const PRIOR_DISTANCES: usize = 288;
+
+/// Costs of a prior by the distance from it, for groups of 1, 2, 4 and 8 vectors and each cap: distances are split into the phases of
+/// [`crate::layout::Layout`], so that those of a vector are contiguous.
+pub(crate) static PRIOR_COSTS: [[[u8; PRIOR_DISTANCES]; PRIOR_CAP as usize + 1]; MAX_VECTORS.ilog2() as usize + 1] = {
+    let mut costs = [[[0; PRIOR_DISTANCES]; PRIOR_CAP as usize + 1]; MAX_VECTORS.ilog2() as usize + 1];
+    let mut log = 0;
+    while log < costs.len() {
+        let vectors = 1 << log;
+        let mut cap = 0;
+        while cap <= PRIOR_CAP as usize {
+            let mut i = 0;
+            while i < PRIOR_DISTANCES {
+                let distance = i.abs_diff(PRIOR_CENTER as usize).saturating_sub(1);
+                costs[log][cap][i % vectors * (PRIOR_DISTANCES / vectors) + i / vectors] =
+                    if distance < cap { distance as u8 } else { cap as u8 };
+                i += 1;
+            }
+            cap += 1;
+        }
+        log += 1;
+    }
+    costs
+};
 
 /// Sets the [`Prior::cap`] of each pixel by the texture of `gray`, into `priors` (resized). Returns whether enough pixels have low texture.
 pub(crate) fn classify_texture(level: Level, gray: &[u8], width: usize, priors: &mut Vec<Prior>) -> bool {

@@ -2,8 +2,8 @@
 
 use crate::StereoOptions;
 use crate::border_mask::{PairMasks, RowMasks};
-use crate::coarse_prior::{PRIOR_CAP, Prior};
-use crate::layout::{BLOCK, Layout, MAX_VECTORS, place};
+use crate::coarse_prior::{PRIOR_CENTER, PRIOR_COSTS, PRIOR_DISTANCES, PRIOR_MARGIN, Prior};
+use crate::layout::{BLOCK, Layout, place};
 use crate::winner::outside_cost;
 use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
@@ -103,6 +103,7 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
     let row = &frame.right[y * planes * n * phase..][..planes * n * phase];
     let out = &mut out[..count * groups * group];
     let here = |p: usize| &left[p * width + xs.start..][..count];
+    let described: [&[u8]; BITS] = std::array::from_fn(here);
     // Pixels `n` apart have their candidates in the same phases, one element further: one vector of all of them at a time, so that the loop
     // reads few slices.
     for class in 0..n.min(count) {
@@ -114,7 +115,6 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
                 let to = (g * n + v) * lanes;
                 let candidates = |p: usize| &row[(of * planes + p) * phase + first + g * lanes..][..steps - 1 + lanes];
                 let bits: [&[u8]; BITS] = std::array::from_fn(candidates);
-                let described: [&[u8]; BITS] = std::array::from_fn(here);
                 let intensity = frame.intensity_cap.map(|cap| (S::u8s::splat(simd, cap), candidates(BITS), here(BITS)));
                 for step in 0..steps {
                     let pixel = count - 1 - class - step * n;
@@ -216,43 +216,13 @@ fn set_masked_costs(frame: &Frame<'_>, masks: &RowMasks<'_>, x: usize, out: &mut
     }
 }
 
-/// Index of distance 0 in [`PRIOR_COSTS`]: the largest group, and [`PRIOR_MARGIN`].
-const PRIOR_CENTER: i32 = 2 * BLOCK as i32 + PRIOR_MARGIN;
-/// Distance outside a group from which on a prior costs its cap at all indices of the group.
-const PRIOR_MARGIN: i32 = 8;
-/// Number of distances, rounded up to a multiple of [`MAX_VECTORS`].
-const PRIOR_DISTANCES: usize = 288;
-
-/// Costs of a prior by the distance from it, for groups of 1, 2, 4 and 8 vectors and each cap: distances are split into the phases of
-/// [`Layout`], so that those of a vector are contiguous.
-const PRIOR_COSTS: [[[u8; PRIOR_DISTANCES]; PRIOR_CAP as usize]; MAX_VECTORS.ilog2() as usize + 1] = {
-    let mut costs = [[[0; PRIOR_DISTANCES]; PRIOR_CAP as usize]; MAX_VECTORS.ilog2() as usize + 1];
-    let mut log = 0;
-    while log < costs.len() {
-        let vectors = 1 << log;
-        let mut cap = 1;
-        while cap <= PRIOR_CAP as usize {
-            let mut i = 0;
-            while i < PRIOR_DISTANCES {
-                let distance = i.abs_diff(PRIOR_CENTER as usize).saturating_sub(1);
-                costs[log][cap - 1][i % vectors * (PRIOR_DISTANCES / vectors) + i / vectors] =
-                    if distance < cap { distance as u8 } else { cap as u8 };
-                i += 1;
-            }
-            cap += 1;
-        }
-        log += 1;
-    }
-    costs
-};
-
 /// Adds the cost of the distance from the prior of a pixel.
 #[inline(always)]
 fn add_prior<S: Simd, const BLOCKS: usize>(simd: S, prior: Prior, out: &mut [u8]) {
     let lanes = S::u8s::LEN;
     let group = BLOCKS * BLOCK;
     let n = group / lanes;
-    let costs = &PRIOR_COSTS[n.ilog2() as usize][usize::from(prior.cap()) - 1];
+    let costs = &PRIOR_COSTS[n.ilog2() as usize][usize::from(prior.cap())];
     for (g, out) in out.chunks_exact_mut(group).enumerate() {
         let local = i32::from(prior.index()) - (g * group) as i32;
         let first = (PRIOR_CENTER - local.clamp(-PRIOR_MARGIN, group as i32 + PRIOR_MARGIN)) as usize;

@@ -30,7 +30,7 @@ const UNKNOWN: f32 = 1e9;
 #[derive(Debug, Default)]
 pub(crate) struct SmoothingBuffers(Vec<Planes>);
 
-/// Padded rows, and rows of zeros above and below.
+/// Padded rows, and rows without disparities above and below.
 #[derive(Debug, Default)]
 struct Planes {
     /// Disparity; where unknown, [`UNKNOWN`], or 0 for the fast global smoother.

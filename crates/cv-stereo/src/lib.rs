@@ -32,6 +32,7 @@ mod edge_preserving;
 mod error;
 mod evaluate;
 mod expansion_region;
+mod fill_cost;
 mod fill_uncertainty;
 mod input;
 mod kernel;

@@ -5,7 +5,7 @@
 //! one, above all in low texture. So each cell at a border becomes a surface of its own with two planes: that of its surface for pixels that
 //! are visible in both images, and the local one for those that are not.
 
-use crate::surfaces::{CELL, Moments, NONE, Plane, Surfaces, center, neighbors};
+use crate::surfaces::{NONE, Plane, Surfaces, center, neighbors};
 use rayon::prelude::*;
 
 /// Radius of the surroundings in cells, textured and textureless: disparities in low texture have errors that only a large area averages.
@@ -48,36 +48,12 @@ impl Surfaces {
         }
         Plane { origin: center(c, self.columns), coefficients, range: self.planes[self.labels[c] as usize].range }
     }
-
-    /// Returns the moments of the cells of the same surface, `spacing` apart within a radius, relative to the center of the cell, and how
-    /// textureless they are, 0 to 1.
-    fn moments_around(&self, c: usize, radius: usize, spacing: usize) -> (Moments, f64) {
-        let columns = self.columns;
-        let rows = self.cells.len() / columns;
-        let (x, y) = (c % columns, c / columns);
-        let inside = |at: usize, count: usize| {
-            let steps = (radius / spacing) as isize;
-            let offsets = (-steps..=steps).map(move |step| step * spacing as isize);
-            offsets.filter(move |&offset| at.checked_add_signed(offset).is_some_and(|at| at < count))
-        };
-        let (mut all, mut texturelessness) = (Moments::default(), 0.0);
-        for dy in inside(y, rows) {
-            for dx in inside(x, columns) {
-                let n = c.wrapping_add_signed(dy * columns as isize + dx);
-                if self.labels[n] == self.labels[c] {
-                    let cell = &self.cells[n].moments;
-                    all.join(&cell.shifted((dx * CELL as isize) as f64, (dy * CELL as isize) as f64));
-                    texturelessness += self.texturelessness(n) * cell.n;
-                }
-            }
-        }
-        (all, texturelessness / all.n)
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::surfaces::CELL;
     use fearless_simd::Level;
 
     const WIDTH: usize = 160;

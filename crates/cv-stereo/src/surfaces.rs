@@ -276,12 +276,9 @@ impl Surfaces {
             // The slope of a single cell is inaccurate: that of the 3×3 cells, if they are one plane.
             let mut all = self.cells[seed].moments;
             let mut around = all;
-            let (sx, sy) = (seed % columns, seed / columns);
-            for y in sy.saturating_sub(1)..(sy + 2).min(rows) {
-                for c in y * columns + sx.saturating_sub(1)..y * columns + (sx + 2).min(columns) {
-                    if c != seed && open(self, c) {
-                        around.join(&moved(&self.cells, c));
-                    }
+            for c in self.around(seed) {
+                if c != seed && open(self, c) {
+                    around.join(&moved(&self.cells, c));
                 }
             }
             let mut plane = around.fit();
@@ -332,18 +329,38 @@ impl Surfaces {
         ys.flat_map(move |y| xs.clone().map(move |x| y * columns + x))
     }
 
+    /// Returns the moments of the cells of the same surface, `spacing` apart within a radius, relative to the center of the cell, and how
+    /// textureless they are, 0 to 1.
+    pub(crate) fn moments_around(&self, c: usize, radius: usize, spacing: usize) -> (Moments, f64) {
+        let columns = self.columns;
+        let rows = self.cells.len() / columns;
+        let (x, y) = (c % columns, c / columns);
+        let inside = |at: usize, count: usize| {
+            let steps = (radius / spacing) as isize;
+            let offsets = (-steps..=steps).map(move |step| step * spacing as isize);
+            offsets.filter(move |&offset| at.checked_add_signed(offset).is_some_and(|at| at < count))
+        };
+        let (mut all, mut texturelessness) = (Moments::default(), 0.0);
+        for dy in inside(y, rows) {
+            for dx in inside(x, columns) {
+                let n = c.wrapping_add_signed(dy * columns as isize + dx);
+                if self.labels[n] == self.labels[c] {
+                    let cell = &self.cells[n].moments;
+                    all.join(&cell.shifted((dx * CELL as isize) as f64, (dy * CELL as isize) as f64));
+                    texturelessness += self.texturelessness(n) * cell.n;
+                }
+            }
+        }
+        (all, texturelessness / all.n)
+    }
+
     /// Returns the distinct labels of a cell and its 8-neighbors, and their number.
     pub(crate) fn labels_around(&self, c: usize) -> ([u32; 9], usize) {
-        let columns = self.columns;
-        let (x, y) = (c % columns, c / columns);
-        let rows = self.cells.len() / columns;
         let (mut found, mut count) = ([NONE; 9], 0);
-        for ny in y.saturating_sub(1)..(y + 2).min(rows) {
-            for &label in &self.labels[ny * columns..][x.saturating_sub(1)..(x + 2).min(columns)] {
-                if label != NONE && !found[..count].contains(&label) {
-                    found[count] = label;
-                    count += 1;
-                }
+        for label in self.around(c).map(|n| self.labels[n]) {
+            if label != NONE && !found[..count].contains(&label) {
+                found[count] = label;
+                count += 1;
             }
         }
         (found, count)
@@ -362,7 +379,6 @@ impl Surfaces {
     /// texture are accurate to a pixel or two, the plane of many cells to a fraction of one.
     pub(crate) fn smooth_low_texture(&self, disparity: &mut [f32], width: usize) {
         let columns = self.columns;
-        let rows = self.cells.len() / columns;
         disparity.par_chunks_mut(CELL * width).enumerate().for_each(|(row, disparity)| {
             let height = disparity.len() / width;
             for x in 0..columns {
@@ -372,17 +388,7 @@ impl Surfaces {
                 if label == NONE || texturelessness == 0.0 || self.sizes[label as usize] < MIN_SMOOTHED_CELLS {
                     continue;
                 }
-                let mut around = Moments::default();
-                for ny in row.saturating_sub(SMOOTHING_RADIUS)..(row + SMOOTHING_RADIUS + 1).min(rows) {
-                    for nx in x.saturating_sub(SMOOTHING_RADIUS)..(x + SMOOTHING_RADIUS + 1).min(columns) {
-                        let n = ny * columns + nx;
-                        if self.labels[n] == label {
-                            let away = |a: usize, b: usize| (a as f64 - b as f64) * CELL as f64;
-                            around.join(&self.cells[n].moments.shifted(away(nx, x), away(ny, row)));
-                        }
-                    }
-                }
-                let [a, b, d] = around.fit();
+                let [a, b, d] = self.moments_around(c, SMOOTHING_RADIUS, 1).0.fit();
                 let (middle_x, middle_y) = center(x, columns);
                 let (xs, ys) = extent(x, columns, (width, height));
                 for y in ys {

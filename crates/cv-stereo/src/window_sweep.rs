@@ -9,7 +9,7 @@
 use crate::aligned_buffer::AlignedBuffer;
 use crate::border_mask::RowMasks;
 use crate::buffer_pool;
-use crate::coarse_prior::PRIOR_CAP;
+use crate::coarse_prior::{PRIOR_CENTER, PRIOR_COSTS};
 use crate::cost::Frame;
 use crate::kernel::penalties;
 use crate::search_window::{SearchWindows, WINDOW};
@@ -85,22 +85,6 @@ struct Strip<'a> {
     first: usize,
 }
 
-/// Costs of a prior by the distance from [`PRIOR_CENTER`], for each cap.
-const PRIOR_COSTS: [[u8; 160]; PRIOR_CAP as usize + 1] = {
-    let mut costs = [[0; 160]; PRIOR_CAP as usize + 1];
-    let mut cap = 0;
-    while cap < costs.len() {
-        let mut i: usize = 0;
-        while i < 160 {
-            let distance = i.abs_diff(PRIOR_CENTER).saturating_sub(1);
-            costs[cap][i] = if distance < cap { distance as u8 } else { cap as u8 };
-            i += 1;
-        }
-        cap += 1;
-    }
-    costs
-};
-const PRIOR_CENTER: usize = 80;
 const LANES: [u16; 16] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15];
 
 #[simd]
@@ -310,8 +294,9 @@ fn compute_costs<S: Simd, const BITS: usize>(simd: S, row: &Row<'_>, xs: Range<u
         }
         if let Some(prior) = priors.map(|priors| priors[x]) {
             let local = (i32::from(prior.index()) - first).clamp(-40, 72);
-            let from = (PRIOR_CENTER as i32 - local) as usize;
-            cost += u8x32::from_slice(simd, &PRIOR_COSTS[usize::from(prior.cap())][from..][..WINDOW]);
+            let from = (PRIOR_CENTER - local) as usize;
+            // Contiguous disparities: groups of one vector.
+            cost += u8x32::from_slice(simd, &PRIOR_COSTS[0][usize::from(prior.cap())][from..][..WINDOW]);
         }
         cost.store_slice(out);
         if let Some(masks) = &masks {

@@ -1,0 +1,193 @@
+//! The data term of hole filling: how well a plane explains why a pixel was not matched. A pixel that is out of view, or occluded by a nearer
+//! match of the right image, has a constant cost; a visible one has the dissimilarity of its correspondence; and one that would occlude a
+//! match of the right image is penalized.
+
+use crate::PixelState;
+use crate::border_mask::PairMasks;
+use crate::layout::Layout;
+use crate::surfaces::{CELL, Plane, Surfaces, center};
+use crate::winner::Winner;
+
+// Set with the constants of `surfaces`; half and twice of each differ by 0.1 points of the errors above 2 px.
+/// Costs of out-of-view and of occluded pixels. A visible one costs 0 to 1.
+const OUT_OF_VIEW_COST: f32 = 0.45;
+pub(crate) const OCCLUDED_COST: f32 = 0.4;
+/// Cost of a pixel that would occlude a match of the right image, and the difference in px from which it is in front.
+const OCCLUDING_COST: f32 = 2.0;
+const OCCLUSION_STEP: f32 = 1.5;
+/// Texture in gray levels at which the dissimilarity of a pixel has half its weight.
+const HALF_TEXTURE: f32 = 3.0;
+/// Fraction of differing census bits of a chance match.
+const CHANCE_BITS: f32 = 0.5;
+/// Weight of the distance of a plane from a matched pixel, per px up to 2, and from a rejected match.
+const MATCH_WEIGHT: f32 = 0.5;
+const REJECTED_WEIGHT: f32 = 0.1;
+
+/// The image pair and its winners.
+#[derive(Clone, Copy)]
+pub(crate) struct Pair<'a> {
+    pub(crate) width: usize,
+    pub(crate) gray: &'a [u8],
+    pub(crate) winners: &'a [Winner],
+    pub(crate) min_disparity: i32,
+    /// The census bits of both views in `planes` bytes per pixel, as in [`crate::cost::Frame`].
+    pub(crate) described: [&'a [u8]; 2],
+    pub(crate) planes: usize,
+    pub(crate) bits: usize,
+    pub(crate) layout: Layout,
+    /// Pixels without data.
+    pub(crate) masks: PairMasks<'a>,
+}
+
+/// Addresses of the census bits of the right image.
+#[derive(Clone, Copy)]
+pub(crate) struct RightColumns {
+    /// Bytes of the census bits of a pixel.
+    bytes: usize,
+    /// Elements of a row and of a phase, and the binary logarithm of the number of phases: see [`Layout`].
+    row: usize,
+    phase: usize,
+    phases: u32,
+    /// The element of column 0.
+    first: i64,
+}
+
+impl RightColumns {
+    pub(crate) fn new(pair: &Pair<'_>) -> Self {
+        Self {
+            bytes: pair.bits.div_ceil(8),
+            row: pair.layout.right_row(pair.width),
+            phase: pair.layout.phase(pair.width),
+            phases: pair.layout.vectors().ilog2(),
+            first: pair.width as i64 - 1 - i64::from(pair.min_disparity),
+        }
+    }
+
+    /// Returns the index of the first byte of a column within a row; `None` outside the search range.
+    #[inline(always)]
+    fn place(&self, column: usize, planes: usize) -> Option<usize> {
+        let element = usize::try_from(self.first - column as i64).ok().filter(|&element| element < self.row)?;
+        Some((element & ((1 << self.phases) - 1)) * planes * self.phase + (element >> self.phases))
+    }
+}
+
+/// The pair with its matches.
+#[derive(Clone, Copy)]
+pub(crate) struct View<'a> {
+    pub(crate) pair: Pair<'a>,
+    pub(crate) columns: RightColumns,
+    pub(crate) right: &'a [f32],
+    pub(crate) disparity: &'a [f32],
+    pub(crate) states: &'a [PixelState],
+}
+
+impl View<'_> {
+    pub(crate) fn height(&self) -> usize {
+        self.disparity.len() / self.pair.width
+    }
+
+    /// Returns the census bits of a pixel of the left image.
+    #[inline(always)]
+    pub(crate) fn bits(&self, x: usize, y: usize) -> u64 {
+        let Pair { width, planes, described, .. } = self.pair;
+        let first = &described[0][y * planes * width + x..];
+        (0..self.columns.bytes).fold(0, |bits, p| bits << 8 | u64::from(first[p * width]))
+    }
+
+    /// Returns the data term of a pixel with these census bits at a disparity; `texture` is the weight of the dissimilarity, 0 to 1.
+    #[inline(always)]
+    pub(crate) fn cost(&self, x: usize, y: usize, d: f32, texture: f32, bits: u64) -> f32 {
+        let Pair { width, planes, described, .. } = self.pair;
+        let column = x as f32 - d + 0.5;
+        if !(column >= 0.0 && column < width as f32) {
+            return OUT_OF_VIEW_COST;
+        }
+        let column = column as usize;
+        let visible = self.right[y * width + column];
+        // −∞: no match there.
+        if visible.is_finite() && d > visible + OCCLUSION_STEP {
+            return OCCLUDING_COST;
+        }
+        if d < visible - 1.0 {
+            return if visible == f32::INFINITY { OUT_OF_VIEW_COST } else { OCCLUDED_COST };
+        }
+        let RightColumns { bytes, row, phase, .. } = self.columns;
+        let Some(place) = self.columns.place(column, planes) else { return OUT_OF_VIEW_COST };
+        let first = &described[1][y * planes * row + place..];
+        let there = (0..bytes).fold(0, |bits, p| bits << 8 | u64::from(first[p * phase]));
+        let chance = CHANCE_BITS * self.pair.bits as f32;
+        0.5 + texture * (((bits ^ there).count_ones() as f32 / chance).min(1.0) - 0.5)
+    }
+
+    /// Returns the plane of a surface in a cell: the local one where it is out of view or occluded.
+    #[inline(always)]
+    pub(crate) fn plane<'a>(&self, surfaces: &'a Surfaces, label: u32, c: usize) -> &'a Plane {
+        let width = self.pair.width;
+        let local = &surfaces.local_planes[label as usize];
+        let (x, y) = center(c, surfaces.columns);
+        let d = local.at(x, y);
+        let (x, y) = ((x as usize).min(width - 1), (y as usize).min(self.height() - 1));
+        match unmatched_state(x, d, &self.right[y * width..][..width]) {
+            PixelState::OutOfView | PixelState::Occluded => local,
+            _ => &surfaces.planes[label as usize],
+        }
+    }
+
+    /// Returns the data terms of planes in a cell, from every `step`-th pixel of every `step`-th row.
+    #[inline(always)]
+    pub(crate) fn cell_costs<const N: usize>(
+        &self,
+        surfaces: &Surfaces,
+        c: usize,
+        planes: &[Option<&Plane>; N],
+        step: usize,
+    ) -> [f32; N] {
+        let width = self.pair.width;
+        let texture = texture_weight(surfaces, c);
+        let mut costs = [0.0; N];
+        let (left, top) = (c % surfaces.columns * CELL, c / surfaces.columns * CELL);
+        for y in (top + step / 2..(top + CELL).min(self.height())).step_by(step) {
+            for x in (left + step / 2..(left + CELL).min(width)).step_by(step) {
+                let i = y * width + x;
+                let d = self.disparity[i];
+                // Weight of the sample: the number of pixels it represents.
+                let weight = (step * step) as f32;
+                let values = planes.iter().map_while(|plane| plane.map(|plane| plane.at(x as f64, y as f64)));
+                if !d.is_nan() {
+                    for (cost, value) in costs.iter_mut().zip(values) {
+                        *cost += weight * MATCH_WEIGHT * (d - value).abs().min(2.0);
+                    }
+                    continue;
+                }
+                let bits = self.bits(x, y);
+                let has_match = !matches!(self.states[i], PixelState::OutOfView | PixelState::NoData);
+                let rejected = (self.pair.min_disparity + i32::from(self.pair.winners[i].index)) as f32;
+                for (cost, value) in costs.iter_mut().zip(values) {
+                    *cost += 0.25 * weight * OCCLUDING_COST * self.cost(x, y, value, texture, bits);
+                    if has_match {
+                        *cost += weight * REJECTED_WEIGHT * (rejected - value).abs().min(2.0);
+                    }
+                }
+            }
+        }
+        costs
+    }
+}
+
+/// Returns the weight of the dissimilarity in a cell, 0 to 1.
+pub(crate) fn texture_weight(surfaces: &Surfaces, c: usize) -> f32 {
+    let steps = surfaces.cells[c].texture;
+    steps / (steps + HALF_TEXTURE)
+}
+
+/// Returns the state of an unmatched pixel by its disparity and the matches of the right image in its row.
+pub(crate) fn unmatched_state(x: usize, d: f32, right: &[f32]) -> PixelState {
+    let column = x as f32 - d + 0.5;
+    if !(column >= 0.0 && column < right.len() as f32) || right[column as usize] == f32::INFINITY {
+        PixelState::OutOfView
+    } else if right[column as usize] > d + 1.0 {
+        PixelState::Occluded
+    } else {
+        PixelState::Mismatched
+    }
+}
