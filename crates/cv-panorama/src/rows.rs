@@ -11,6 +11,9 @@ pub(crate) fn is_check_due(y: usize, width: usize) -> bool {
     y.is_multiple_of((SAMPLES_PER_CHECK / width.max(1)).max(1))
 }
 
+/// Rows of one task: few enough that tasks are balanced on an image of some hundred rows.
+const ROWS_PER_TASK: usize = 8;
+
 /// Calls `work` with the index and the samples of every row of `data`, in parallel.
 ///
 /// # Errors
@@ -24,7 +27,7 @@ pub(crate) fn for_each_row<T: Send>(
     for_each_row_with(data, width, stage, || (), |(), y, row| work(y, row))
 }
 
-/// As [`for_each_row`], with a scratch buffer per run of rows of one thread.
+/// As [`for_each_row`], with a scratch buffer for the rows of one task.
 ///
 /// # Errors
 /// [`Cancelled`]; rows may then be missing.
@@ -35,13 +38,26 @@ pub(crate) fn for_each_row_with<T: Send, B>(
     buffer: impl Fn() -> B + Sync,
     work: impl Fn(&mut B, usize, &mut [T]) + Sync,
 ) -> Result<(), Cancelled> {
-    data.par_chunks_mut(width.max(1)).enumerate().try_for_each_init(&buffer, |buffer, (y, row)| {
-        if is_check_due(y, width) {
-            stage.check()?;
+    let width = width.max(1);
+    for_each_chunk(data, ROWS_PER_TASK * width, &|task, rows| {
+        let mut buffer = buffer();
+        for (row, y) in rows.chunks_mut(width).zip(ROWS_PER_TASK * task..) {
+            if is_check_due(y, width) {
+                stage.check()?;
+            }
+            work(&mut buffer, y, row);
         }
-        work(buffer, y, row);
         Ok(())
     })
+}
+
+/// Calls `work` with the index and the elements of every chunk, in parallel. By dynamic dispatch: every instance of a parallel loop takes as long to compile as a thousand lines.
+fn for_each_chunk<T: Send>(
+    data: &mut [T],
+    size: usize,
+    work: &(dyn Fn(usize, &mut [T]) -> Result<(), Cancelled> + Sync),
+) -> Result<(), Cancelled> {
+    data.par_chunks_mut(size).enumerate().try_for_each(|(i, chunk)| work(i, chunk))
 }
 
 #[cfg(test)]

@@ -143,27 +143,57 @@ impl Context {
         output: Output<'_>,
         write: impl FnOnce(&Path) -> Result<T, E>,
     ) -> Result<T, Failure> {
-        if let (Output::File(path, endings), false) = (output, output.has_name()) {
-            let folder = tempfile::tempdir().during("cannot create a temporary folder")?;
-            let file = folder.path().join("output").with_extension(endings.first().unwrap_or(&""));
-            let result = write(&file).map_err(Into::into)?;
-            let bytes = cv_io::read_bytes(&file)?;
-            if is_stdout(path) {
-                self.keep_for_stdout(bytes);
-            } else {
-                let device = fs::File::options().write(true).open(path);
-                device
-                    .and_then(|mut device| device.write_all(&bytes))
-                    .during(format!("cannot write {}", path.display()))?;
+        let target = Target::new(output)?;
+        match write(&target.path) {
+            Ok(result) => {
+                self.deliver(output, &target)?;
+                Ok(result)
             }
-            return Ok(result);
+            Err(error) => {
+                target.remove_folders();
+                Err(error.into())
+            }
         }
-        let made = make_folders(output.folder())?;
-        write(output.path()).map_err(|error| {
-            // Only empty folders are removed.
-            made.iter().for_each(|folder| drop(fs::remove_dir(folder)));
-            error.into()
-        })
+    }
+
+    /// Passes a temporary file on to stdout or a device. Not generic, as is [`Target`]: `write` has an instance for every kind of output.
+    fn deliver(&self, output: Output<'_>, target: &Target) -> Result<(), Failure> {
+        if target.temporary.is_none() {
+            return Ok(());
+        }
+        let (path, bytes) = (output.path(), cv_io::read_bytes(&target.path)?);
+        if is_stdout(path) {
+            self.keep_for_stdout(bytes);
+            return Ok(());
+        }
+        let device = fs::File::options().write(true).open(path);
+        device.and_then(|mut device| device.write_all(&bytes)).during(format!("cannot write {}", path.display()))
+    }
+}
+
+/// Where an output is written to.
+struct Target {
+    path: PathBuf,
+    /// The folder of `path`, if the output is for stdout or a device.
+    temporary: Option<tempfile::TempDir>,
+    /// Folders that were missing, the innermost first.
+    created: Vec<PathBuf>,
+}
+
+impl Target {
+    fn new(output: Output<'_>) -> Result<Self, Failure> {
+        if let (Output::File(_, endings), false) = (output, output.has_name()) {
+            let folder = tempfile::tempdir().during("cannot create a temporary folder")?;
+            let path = folder.path().join("output").with_extension(endings.first().unwrap_or(&""));
+            return Ok(Self { path, temporary: Some(folder), created: Vec::new() });
+        }
+        let created = create_folders(output.folder())?;
+        Ok(Self { path: output.path().to_owned(), temporary: None, created })
+    }
+
+    /// Removes the folders created for an output that could not be written, if they are empty.
+    fn remove_folders(&self) {
+        self.created.iter().for_each(|folder| drop(fs::remove_dir(folder)));
     }
 }
 
@@ -180,7 +210,7 @@ fn nearest(folder: &Path) -> &Path {
 }
 
 /// Creates a folder and its ancestors. Returns those that were missing, the innermost first.
-fn make_folders(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
+fn create_folders(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     let missing: Vec<PathBuf> = folder.ancestors().take_while(|above| !above.exists()).map(Path::to_owned).collect();
     fs::create_dir_all(folder).during(format!("cannot create the folder {}", folder.display()))?;
     Ok(missing)
