@@ -51,12 +51,12 @@ pub(crate) fn for_each_row_with<T: Send, B>(
     })
 }
 
-/// Calls `work` with the index and the elements of every chunk, in parallel. By dynamic dispatch: every instance of a parallel loop takes as long to compile as a thousand lines.
-fn for_each_chunk<T: Send>(
-    data: &mut [T],
-    size: usize,
-    work: &(dyn Fn(usize, &mut [T]) -> Result<(), Cancelled> + Sync),
-) -> Result<(), Cancelled> {
+/// Work on a chunk, called with its index and elements.
+type ChunkWork<'a, T> = dyn Fn(usize, &mut [T]) -> Result<(), Cancelled> + Sync + 'a;
+
+/// Calls `work` for every chunk, in parallel. By dynamic dispatch: every instance of a parallel loop takes as long to compile as a
+/// thousand lines.
+fn for_each_chunk<T: Send>(data: &mut [T], size: usize, work: &ChunkWork<'_, T>) -> Result<(), Cancelled> {
     data.par_chunks_mut(size).enumerate().try_for_each(|(i, chunk)| work(i, chunk))
 }
 
