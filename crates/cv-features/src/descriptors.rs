@@ -24,7 +24,7 @@ impl Descriptors {
     }
 
     pub(crate) fn push(&mut self, row: &[f32]) {
-        debug_assert_eq!(row.len(), self.dimension());
+        assert_eq!(row.len(), self.dimension());
         self.data.extend_from_slice(row);
     }
 

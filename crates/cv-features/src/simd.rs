@@ -15,7 +15,7 @@ pub(crate) fn level() -> Level {
 /// Convolves vertically with a symmetric kernel, given as its half: `out[x] = k[0]·rows[r][x] + Σ k[t]·(rows[r−t][x] +
 /// rows[r+t][x])`, `t` from 1 to `r = k.len() − 1`.
 pub(crate) fn vertical(level: Level, out: &mut [f32], rows: &[&[f32]], kernel: &[f32]) {
-    debug_assert!(rows.len() == 2 * kernel.len() - 1 && rows.iter().all(|r| r.len() == out.len()));
+    assert!(rows.len() == 2 * kernel.len() - 1 && rows.iter().all(|r| r.len() == out.len()));
     dispatch!(level, simd => symmetric(simd, out, kernel, VerticalTaps { rows }));
 }
 
@@ -29,15 +29,15 @@ pub(crate) fn vertical_phases(
     evens: &[f32],
     odds: &[f32],
 ) {
-    debug_assert!(rows.len() == 2 * evens.len() && rows.iter().all(|r| r.len() == even.len()));
-    debug_assert!(evens.len() == odds.len() && even.len() == odd.len());
+    assert!(rows.len() == 2 * evens.len() && rows.iter().all(|r| r.len() == even.len()));
+    assert!(evens.len() == odds.len() && even.len() == odd.len());
     dispatch!(level, simd => phases(simd, [even, odd], evens, odds, VerticalTaps { rows }));
 }
 
 /// Convolves horizontally with a symmetric kernel, given as its half: `out[x] = k[0]·row[x+r] + Σ k[t]·(row[x+r−t] +
 /// row[x+r+t])`, `t` from 1 to `r = k.len() − 1`.
 pub(crate) fn horizontal(level: Level, out: &mut [f32], row: &[f32], kernel: &[f32]) {
-    debug_assert_eq!(row.len(), out.len() + 2 * (kernel.len() - 1));
+    assert_eq!(row.len(), out.len() + 2 * (kernel.len() - 1));
     dispatch!(level, simd => symmetric(simd, out, kernel, HorizontalTaps { row }));
 }
 
@@ -45,8 +45,8 @@ pub(crate) fn horizontal(level: Level, out: &mut [f32], row: &[f32], kernel: &[f
 /// and `odd` half-way to the next ones, as `Σ o[t]·(row[x+r−t] + row[x+r+1+t])`, `t` from 0 to `r`. Both half-kernels
 /// have `r + 1` taps.
 pub(crate) fn horizontal_phases(level: Level, [even, odd]: [&mut [f32]; 2], row: &[f32], evens: &[f32], odds: &[f32]) {
-    debug_assert!(row.len() + 1 == even.len() + 2 * evens.len());
-    debug_assert!(evens.len() == odds.len() && even.len() == odd.len());
+    assert!(row.len() + 1 == even.len() + 2 * evens.len());
+    assert!(evens.len() == odds.len() && even.len() == odd.len());
     dispatch!(level, simd => phases(simd, [even, odd], evens, odds, HorizontalTaps { row }));
 }
 

@@ -173,7 +173,7 @@ impl GridCut {
 
     fn add_edge(&mut self, node: usize, direction: usize, forward: i32, backward: i32) {
         let other = self.neighbor(node, direction);
-        debug_assert!(other + 1 < self.nodes.len());
+        assert!(other + 1 < self.nodes.len());
         self.nodes[node].capacity[direction] += forward;
         self.nodes[other].capacity[direction ^ 1] += backward;
     }

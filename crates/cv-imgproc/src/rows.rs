@@ -46,7 +46,7 @@ pub(crate) fn for_rows2<T: Sample, const C: usize, U: Sample, const D: usize>(
     second: &mut Image<U, D>,
     f: impl Fn(usize, &mut [T], &mut [U]) + Sync,
 ) {
-    debug_assert_eq!(first.size(), second.size());
+    assert_eq!(first.size(), second.size());
     let (a, b) = (first.width() * C, second.width() * D);
     if first.is_empty() {
         return;

@@ -14,7 +14,7 @@ pub(crate) fn level() -> Level {
 /// Filters vertically: `out[x] = half[0]·rows[r][x] + Σ half[t]·(rows[r−t][x] + rows[r+t][x])`, kernel radius `r = half.len() − 1`, `2r + 1` rows as
 /// long as `out`.
 pub(crate) fn filter_columns(level: Level, out: &mut [f32], rows: &[&[f32]], half: &[f32]) {
-    debug_assert!(rows.len() == 2 * half.len() - 1 && rows.iter().all(|r| r.len() == out.len()));
+    assert!(rows.len() == 2 * half.len() - 1 && rows.iter().all(|r| r.len() == out.len()));
     let r = half.len() - 1;
     dispatch!(level, simd => filter(simd, out, half, #[inline(always)] |t, x, n| (&rows[r - t][x..x + n], &rows[r + t][x..x + n])));
 }
@@ -22,7 +22,7 @@ pub(crate) fn filter_columns(level: Level, out: &mut [f32], rows: &[&[f32]], hal
 /// Filters horizontally: `out[x] = half[0]·row[x + r c] + Σ half[t]·(row[x + (r−t) c] + row[x + (r+t) c])`, `c` channels; `row` has `2 r c` more
 /// samples than `out`.
 pub(crate) fn filter_rows(level: Level, out: &mut [f32], row: &[f32], half: &[f32], c: usize) {
-    debug_assert_eq!(row.len(), out.len() + 2 * (half.len() - 1) * c);
+    assert_eq!(row.len(), out.len() + 2 * (half.len() - 1) * c);
     let r = half.len() - 1;
     dispatch!(level, simd => filter(simd, out, half, #[inline(always)] |t, x, n| {
         let (a, b) = (x + (r - t) * c, x + (r + t) * c);

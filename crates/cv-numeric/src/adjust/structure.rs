@@ -439,7 +439,7 @@ fn merge_blocks(
         (active_blocks[members[0]].considered.is_some(), observed_points[members[0]].len())
     });
     let mut location: Vec<Vec<(u32, u32)>> = active_index.iter().map(|g| vec![(NONE, 0); g.len()]).collect();
-    debug_assert_eq!(groups.len(), location.len());
+    assert_eq!(groups.len(), location.len());
     let (mut blocks, mut column) = (Vec::with_capacity(sets.len()), 0);
     for (b, (members, size)) in sets.iter().enumerate() {
         let mut block = ReducedBlock { members: Vec::with_capacity(members.len()), column, size: *size };

@@ -53,7 +53,7 @@ impl Template {
     #[inline(always)]
     fn scores_inner(&self, window: &[f32]) -> [f32; SEARCH_SIDE * SEARCH_SIDE] {
         let wide = self.side + 2 * SEARCH_RADIUS;
-        debug_assert_eq!(window.len(), wide * wide + PAD);
+        assert_eq!(window.len(), wide * wide + PAD);
         let row = |r: usize| &window[r * wide..][..self.side - 1 + LANES];
         // Sums along each row of the window, which all vertical shifts share. (Arrays of their own, which stay in registers.)
         let mut along = Vec::with_capacity(wide);
