@@ -2,7 +2,7 @@
 
 use crate::Pixel;
 use cv_core::ImageView;
-use fearless_simd::{f32x4, f32x16, prelude::*, u8x16};
+use fearless_simd::{f32x4, f32x16, i32x16, prelude::*, u8x16};
 
 /// Tolerance in pixels for points outside the outermost pixel centers, which are clamped to them: the rounding of an `f32` map of
 /// a few thousand pixels.
@@ -81,11 +81,33 @@ pub fn sample_bicubic<T: Pixel, const C: usize>(view: ImageView<'_, T, C>, x: f6
     interpolate_with(view, x, y, bicubic_at)
 }
 
+/// Coefficients of the polynomials of the four weights of Keys's kernel, from the cubic term to the constant.
+pub(crate) const KEYS: [[f32; 4]; 4] =
+    [[-0.5, 1.5, -1.5, 0.5], [1.0, -2.5, 2.0, -0.5], [-0.5, 0.0, 0.5, 0.0], [0.0, 1.0, 0.0, 0.0]];
+
 /// Computes the four weights of Keys's kernel for a fraction in 0 to 1.
 #[inline(always)]
 fn keys_weights(t: f32) -> [f32; 4] {
-    let (t2, t3) = (t * t, t * t * t);
-    [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
+    let mut weights = KEYS[0];
+    for coefficients in &KEYS[1..] {
+        for (weight, c) in weights.iter_mut().zip(coefficients) {
+            *weight = *weight * t + c;
+        }
+    }
+    weights
+}
+
+/// As [`keys_weights`], in one vector.
+#[inline(always)]
+fn keys_weights_in_vector<S: Simd>(simd: S, t: f32) -> [f32; 4] {
+    let t = f32x4::splat(simd, t);
+    let mut weights = f32x4::from_slice(simd, &KEYS[0]);
+    for coefficients in &KEYS[1..] {
+        weights = weights * t + f32x4::from_slice(simd, coefficients);
+    }
+    let mut array = [0.0; 4];
+    weights.store_slice(&mut array);
+    array
 }
 
 /// Interpolates bicubically from the base pixel `(ix, iy)`, which must be in the image, by the fractions `fx`, `fy` in 0 to 1; see
@@ -138,21 +160,24 @@ pub fn bicubic_rgb_at<S: Simd>(
     if near_border {
         return bicubic_near_border(view, ix, iy, fx, fy);
     }
-    let (wx, wy) = (keys_weights(fx), keys_weights(fy));
+    let (wx, wy) = (keys_weights_in_vector(simd, fx), keys_weights_in_vector(simd, fy));
     // No closures: they would not be inlined, nor would the vector operations in them.
     let mut sums = f32x16::splat(simd, 0.0);
     for (j, wy) in wy.into_iter().enumerate() {
         let bytes = u8x16::from_slice(simd, &view.row(iy + j - 1)[3 * ix - 3..3 * ix + 13]);
         let (low, high) = bytes.widen();
         let (low, high) = low.combine(high).widen();
-        sums += low.combine(high).to_float::<f32x16<S>>() * f32x16::splat(simd, wy);
+        // As signed integers, which unlike unsigned ones every instruction set converts.
+        let samples = low.combine(high).bitcast::<i32x16<S>>();
+        sums += samples.to_float::<f32x16<S>>() * f32x16::splat(simd, wy);
     }
-    let mut lanes = [0.0; 16];
-    sums.store_slice(&mut lanes);
-    let mut sum = f32x4::from_slice(simd, &lanes[..4]) * f32x4::splat(simd, wx[0]);
-    for k in 1..4 {
-        sum += f32x4::from_slice(simd, &lanes[3 * k..3 * k + 4]) * f32x4::splat(simd, wx[k]);
-    }
+    // Each pixel's three samples moved to the first lanes. (A load from an array of all of them would wait for its stores.)
+    let (low, high) = sums.split();
+    let ((a, b), (c, d)) = (low.split(), high.split());
+    let sum = a * f32x4::splat(simd, wx[0])
+        + a.slide::<3>(b) * f32x4::splat(simd, wx[1])
+        + b.slide::<2>(c) * f32x4::splat(simd, wx[2])
+        + c.slide::<1>(d) * f32x4::splat(simd, wx[3]);
     let mut value = [0.0; 4];
     sum.store_slice(&mut value);
     [value[0], value[1], value[2]]

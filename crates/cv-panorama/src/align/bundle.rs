@@ -121,6 +121,23 @@ pub(crate) struct Problem<'a> {
     pub(crate) loss: RobustLoss,
 }
 
+/// When an adjustment ends: a wrong model converges slowly, along a valley of focal length and distortion.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Limits {
+    max_iterations: usize,
+    /// Relative decrease of the cost.
+    cost_tolerance: f64,
+}
+
+impl Limits {
+    /// For a start, of which only the basin of attraction matters.
+    pub(crate) const START: Self = Self { max_iterations: 30, cost_tolerance: 1e-3 };
+    /// For model selection, where a model must reduce the cost by percents.
+    pub(crate) const SELECTION: Self = Self { max_iterations: 50, cost_tolerance: 1e-4 };
+    /// For the result.
+    pub(crate) const RESULT: Self = Self { max_iterations: 50, cost_tolerance: 1e-7 };
+}
+
 /// Maximum number of Newton steps; ordinary lenses take three to five.
 const MAX_NEWTON_STEPS: usize = 10;
 /// Residual at which Newton's method stops, relative to the focal length.
@@ -229,15 +246,15 @@ impl Problem<'_> {
     }
 
     /// Minimizes the transfer errors from `start`; returns the state and its cost. A start that is not finite is returned with infinite cost.
-    pub(crate) fn solve(&self, start: State, max_iterations: usize) -> (State, f64) {
+    pub(crate) fn solve(&self, start: State, limits: Limits) -> (State, f64) {
         let mut state = start.clone();
-        match self.adjust(&mut state, max_iterations) {
+        match self.adjust(&mut state, limits) {
             Ok(report) => (state, report.cost),
             Err(_) => (start, f64::INFINITY),
         }
     }
 
-    fn adjust(&self, state: &mut State, max_iterations: usize) -> Result<AdjustReport, AdjustError> {
+    fn adjust(&self, state: &mut State, limits: Limits) -> Result<AdjustReport, AdjustError> {
         let mut problem = Adjustment::default();
         let numbers = state.motion.iter().flat_map(|m| m.iter().copied()).collect();
         let lenses = state.lenses.iter().flat_map(|l| [l.log_focal, l.k1]).collect();
@@ -270,7 +287,8 @@ impl Problem<'_> {
         let prior = Prior { items: self.focal_prior.iter().map(prior_item).collect() };
         let blocks = (0..self.focal_prior.len() as u32).map(|l| [l]).collect();
         problem.add_residuals("lens priors", prior, [lenses], blocks, RobustLoss::Trivial)?;
-        let options = AdjustOptions { max_iterations, cost_tolerance: 1e-7, ..AdjustOptions::default() };
+        let Limits { max_iterations, cost_tolerance } = limits;
+        let options = AdjustOptions { max_iterations, cost_tolerance, ..AdjustOptions::default() };
         let report = problem.solve(&options, |_| ControlFlow::Continue(()))?;
         for (motion, x) in state.motion.iter_mut().zip(problem.values(motions).chunks_exact(9)) {
             motion.copy_from_slice(x);
@@ -291,10 +309,11 @@ impl Problem<'_> {
         let (mut matches, mut blocks) = (Vec::new(), Vec::new());
         for o in self.overlaps {
             let [i, j, from, to] = [o.i, o.j, self.lens_of[o.i], self.lens_of[o.j]].map(|n| n as u32);
-            for &(a, b) in &o.points {
-                matches.extend([(a, b), (b, a)]);
-                blocks.extend([[i, j, from, to], [j, i, to, from]]);
-            }
+            // One direction after the other: consecutive residuals of the same blocks are accumulated together.
+            matches.extend(&o.points);
+            matches.extend(o.points.iter().map(|&(a, b)| (b, a)));
+            blocks.resize(blocks.len() + o.points.len(), [i, j, from, to]);
+            blocks.resize(blocks.len() + o.points.len(), [j, i, to, from]);
         }
         let transfers = Transfers::<M, C> { kind: self.kind, matches };
         problem.add_residuals("matches", transfers, [motions, motions, lenses, lenses], blocks, self.loss)
@@ -415,7 +434,8 @@ mod tests {
         let wobble = Rotation3::new(Vector3::new(0.03, -0.05, 0.02));
         let motion =
             rotations.iter().enumerate().map(|(i, r)| if i == 1 { *r } else { wobble * r }.into_inner()).collect();
-        let (state, _) = problem.solve(State { motion, lenses: vec![Lens { log_focal: start, k1: 0.0 }] }, 100);
+        let (state, _) =
+            problem.solve(State { motion, lenses: vec![Lens { log_focal: start, k1: 0.0 }] }, Limits::RESULT);
         // The prior on the focal length (one pixel² per 0.3²) pulls against ten thousand matches: some 1e-6 of a radian.
         assert!((state.lenses[0].log_focal.exp() / truth - 1.0).abs() < 1e-5, "{:?}", state);
         assert!((state.lenses[0].k1 + 0.05).abs() < 1e-5);
@@ -445,7 +465,7 @@ mod tests {
         };
         let motion = rotations.iter().map(|r| r.into_inner()).collect();
         let (state, _) =
-            problem.solve(State { motion, lenses: vec![Lens { log_focal: 690.0_f64.ln(), k1: 0.0 }] }, 100);
+            problem.solve(State { motion, lenses: vec![Lens { log_focal: 690.0_f64.ln(), k1: 0.0 }] }, Limits::RESULT);
         // A match off by 25 px pulls with weight 1/625: a tenth of them, all the same way, by 0.1 · 25/625 = 0.004 px of 700 px.
         assert!((state.lenses[0].log_focal.exp() - 700.0).abs() < 1.0);
         let relative = state.motion[3] * state.motion[0].transpose();

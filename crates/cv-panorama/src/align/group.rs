@@ -1,6 +1,6 @@
 //! Alignment of one connected component of the match graph: initialization along a spanning tree, then bundle adjustment over all overlaps.
 
-use crate::align::bundle::{Lens, Motion, Overlap, Problem, State};
+use crate::align::bundle::{Lens, Limits, Motion, Overlap, Problem, State};
 use crate::align::focal::focals_from_homography;
 use crate::align::metric::{in_front, metric_frame};
 use crate::align::straighten::straighten;
@@ -225,7 +225,7 @@ impl<'a> Group<'a> {
                 .collect();
             let motion = self.compose(Motion::Rotation, &lens_of, &lenses);
             stage.check()?;
-            Ok(wide.solve(State { motion, lenses }, 30))
+            Ok(wide.solve(State { motion, lenses }, Limits::START))
         };
         let starts: Vec<(State, f64)> = factors.iter().map(start).collect::<Result<_, Cancelled>>()?;
         let Some((state, _)) = starts.into_iter().min_by(|x, y| x.1.total_cmp(&y.1)) else {
@@ -233,14 +233,14 @@ impl<'a> Group<'a> {
         };
         stage.check()?;
         let mut problem = self.problem(Motion::Rotation, &lens_of, &prior, options.outlier_px);
-        let (mut state, mut cost) = problem.solve(state, 50);
+        let (mut state, mut cost) = problem.solve(state, Limits::SELECTION);
         // Model selection: an unknown must reduce the cost by 5 %; parallax alone gives less.
         let is_significant = |new: f64, old: f64| new < 0.95 * old - 20.0 * options.outlier_px.powi(2);
         let calibrated = self.photos.iter().any(|p| p.camera.is_some());
         if options.refine_distortion && !calibrated {
             stage.check()?;
             let radial = Problem { free_k1: true, ..problem.clone() };
-            let (with, new) = radial.solve(state.clone(), 50);
+            let (with, new) = radial.solve(state.clone(), Limits::SELECTION);
             if is_significant(new, cost) {
                 (state, cost) = (with, new);
                 problem = radial;
@@ -253,14 +253,16 @@ impl<'a> Group<'a> {
             let own_prior: Vec<(f64, f64)> = lens_of.iter().map(|&l| (state.lenses[l].log_focal, prior[l].1)).collect();
             let lenses = lens_of.iter().map(|&l| state.lenses[l]).collect();
             let apart = Problem { lens_of: &own, focal_prior: &own_prior, ..problem.clone() };
-            let (with, new) = apart.solve(State { motion: state.motion.clone(), lenses }, 50);
+            let (with, new) = apart.solve(State { motion: state.motion.clone(), lenses }, Limits::SELECTION);
             // Without a significant spread the reduction is due to parallax.
             let focals = with.lenses.iter().map(|l| l.log_focal);
             let spread = focals.clone().fold(f64::MIN, f64::max) - focals.fold(f64::MAX, f64::min);
             if is_significant(new, cost) && new < 0.8 * cost && spread > MIN_ZOOM_LOG_SPREAD {
-                return Ok(Solution { lens_of: own, prior: own_prior, state: with });
+                let (state, _) = apart.solve(with, Limits::RESULT);
+                return Ok(Solution { lens_of: own, prior: own_prior, state });
             }
         }
+        let (state, _) = problem.solve(state, Limits::RESULT);
         Ok(Solution { lens_of, prior, state })
     }
 
@@ -276,10 +278,10 @@ impl<'a> Group<'a> {
         let few = self.subsampled_overlaps();
         let wide =
             Problem { overlaps: &few, ..self.problem(Motion::Homography, &lens_of, &prior, 10.0 * options.outlier_px) };
-        let (state, _) = wide.solve(State { motion, lenses }, 30);
+        let (state, _) = wide.solve(State { motion, lenses }, Limits::START);
         stage.check()?;
         let problem = self.problem(Motion::Homography, &lens_of, &prior, options.outlier_px);
-        let (state, _) = problem.solve(state, 50);
+        let (state, _) = problem.solve(state, Limits::RESULT);
         Ok(Solution { lens_of, prior, state })
     }
 

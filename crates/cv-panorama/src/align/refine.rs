@@ -6,7 +6,7 @@
 use crate::align::{AlignError, AlignOptions, Alignment, Photo, View, align};
 use cv_core::{Cancelled, Correspondence, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
 use cv_geometry::VerifiedPair;
-use cv_imgproc::bicubic_at;
+use cv_imgproc::{SAMPLE_LANES, bicubic_lanes};
 use fearless_simd::{Level, dispatch};
 use nalgebra::{SMatrix, SVector};
 use rayon::prelude::*;
@@ -257,18 +257,18 @@ fn sample(level: Level, image: &GrayU8, b: Point2<f64>, warp: &Warp, patch: &mut
 
 #[inline(always)]
 fn sample_rows(image: &GrayU8, b: Vector2<f32>, warp: &Warp, patch: &mut [f32; WIDE * STRIDE]) {
-    let (right, bottom) = ((image.width() - 1) as f32, (image.height() - 1) as f32);
-    let view = image.view();
     let offset = (WIDE / 2) as f32;
+    let (mut us, mut vs) = ([0.0_f32; SAMPLE_LANES], [0.0_f32; SAMPLE_LANES]);
     for (j, row) in patch.chunks_exact_mut(STRIDE).enumerate() {
         let [base, linear, square] = warp.row(j as f64 - f64::from(offset));
-        for (i, value) in row[..WIDE].iter_mut().enumerate() {
-            let i = i as f32 - offset;
-            let p = b + base + linear * i + square * (i * i);
-            // Single-precision rounding stays within the image.
-            let (u, v) = (p.x.clamp(0.0, right), p.y.clamp(0.0, bottom));
-            let (x, y) = (u as usize, v as usize);
-            [*value] = bicubic_at(view, x, y, u - x as f32, v - y as f32);
+        let start = b + base;
+        for (first, values) in (0..).step_by(SAMPLE_LANES).zip(row[..WIDE].chunks_mut(SAMPLE_LANES)) {
+            for k in 0..SAMPLE_LANES {
+                let i = (first + k as i32) as f32 - offset;
+                us[k] = start.x + linear.x * i + square.x * (i * i);
+                vs[k] = start.y + linear.y * i + square.y * (i * i);
+            }
+            values.copy_from_slice(&bicubic_lanes(image, &us, &vs)[..values.len()]);
         }
     }
 }

@@ -70,13 +70,9 @@ impl Tone {
     /// Returns the fractional index into `levels` for a level: that of the nearest table entry, or, if `FINE`, linearly interpolated.
     #[inline(always)]
     fn index<const FINE: bool>(&self, level: f32) -> f32 {
-        if FINE {
-            let (i, fraction) = split(level.clamp(0.0, 255.0) * ENTRIES_PER_LEVEL as f32);
-            let (low, high) = (self.log_radiance[i & 2047], self.log_radiance[(i + 1) & 2047]);
-            return low + fraction * (high - low);
-        }
-        let (i, _) = split(level.clamp(0.0, 255.0) * ENTRIES_PER_LEVEL as f32 + 0.5);
-        self.log_radiance[i & 2047]
+        let (i, fraction) = entry_of_level::<FINE>(level);
+        let low = self.log_radiance[i & 2047];
+        if FINE { low + fraction * (self.log_radiance[(i + 1) & 2047] - low) } else { low }
     }
 
     /// Returns log₂ of the radiance of a level; 0 for white.
@@ -88,10 +84,56 @@ impl Tone {
     /// Returns the level of the panorama at a fractional index into `levels`.
     #[inline(always)]
     fn level(&self, index: f32) -> f32 {
-        let (i, fraction) = split(index.clamp(0.0, 1022.0));
+        let (i, fraction) = entry_of_index(index);
         let (low, high) = (self.levels[i & 1023], self.levels[(i + 1) & 1023]);
         low + fraction * (high - low)
     }
+
+    /// Replaces levels of a photograph by those of the panorama, after a gain in table entries: [`Self::level`] of [`Self::index`], one loop per step, so that all but the lookups are
+    /// vectorized.
+    #[inline(always)]
+    fn map<const FINE: bool>(&self, values: &mut [f32; LANES], gains: &[f32; LANES]) {
+        let (mut entries, mut fractions) = ([0; LANES], [0.0; LANES]);
+        let (mut low, mut high) = ([0.0; LANES], [0.0; LANES]);
+        for k in 0..LANES {
+            let (i, fraction) = entry_of_level::<FINE>(values[k]);
+            (entries[k], fractions[k]) = (i as u32, fraction);
+        }
+        for k in 0..LANES {
+            let i = entries[k] as usize;
+            low[k] = self.log_radiance[i & 2047];
+            if FINE {
+                high[k] = self.log_radiance[(i + 1) & 2047];
+            }
+        }
+        for k in 0..LANES {
+            let index = if FINE { low[k] + fractions[k] * (high[k] - low[k]) } else { low[k] };
+            let (i, fraction) = entry_of_index(index + gains[k]);
+            (entries[k], fractions[k]) = (i as u32, fraction);
+        }
+        for k in 0..LANES {
+            let i = entries[k] as usize;
+            (low[k], high[k]) = (self.levels[i & 1023], self.levels[(i + 1) & 1023]);
+        }
+        for k in 0..LANES {
+            values[k] = low[k] + fractions[k] * (high[k] - low[k]);
+        }
+    }
+}
+
+/// Number of samples that are mapped at a time: two vectors of eight.
+const LANES: usize = 16;
+
+/// Returns the entry of `log_radiance` for a level (the nearest, or, if `FINE`, the one before it) and the fraction of the way to the next.
+#[inline(always)]
+fn entry_of_level<const FINE: bool>(level: f32) -> (usize, f32) {
+    split(level.clamp(0.0, 255.0) * ENTRIES_PER_LEVEL as f32 + if FINE { 0.0 } else { 0.5 })
+}
+
+/// Returns the entry of `levels` before a fractional index, and the fraction of the way to the next.
+#[inline(always)]
+fn entry_of_index(index: f32) -> (usize, f32) {
+    split(index.clamp(0.0, 1022.0))
 }
 
 /// Splits a number of 0 to some thousands into an integer and a fraction of 0 to 1 (an integer may give itself less one, and 1). Avoids the saturating
@@ -191,7 +233,19 @@ impl<'a> ExposureCorrection<'a> {
         }
         // One channel at a time, so that lookups of different pixels overlap.
         for (values, gain) in [r, g, b].into_iter().zip(self.gain) {
-            for ((value, lift), clipped) in values.iter_mut().zip(lifts).zip(&*clipped) {
+            let ((values, last), (lifts, last_lifts)) = (values.as_chunks_mut::<LANES>(), lifts.as_chunks::<LANES>());
+            let (clipped, last_clipped) = clipped.as_chunks::<LANES>();
+            for ((values, lifts), clipped) in values.iter_mut().zip(lifts).zip(clipped) {
+                let mut gains = [0.0; LANES];
+                for (entries, lift) in gains.iter_mut().zip(lifts) {
+                    *entries = (gain + lift) * ENTRIES_PER_STOP;
+                }
+                self.tone.map::<FINE>(values, &gains);
+                for (value, clipped) in values.iter_mut().zip(clipped) {
+                    *value += clipped * (255.0 - *value);
+                }
+            }
+            for ((value, lift), clipped) in last.iter_mut().zip(last_lifts).zip(last_clipped) {
                 let tone = self.tone.level(self.tone.index::<FINE>(*value) + (gain + lift) * ENTRIES_PER_STOP);
                 *value = tone + clipped * (255.0 - tone);
             }
@@ -225,6 +279,36 @@ mod tests {
             let v = k as f32 / 8.0;
             let (i, fraction) = split(v);
             assert!((0.0..=1.0).contains(&fraction) && i as f32 + fraction == v, "{v}: {i} {fraction}");
+        }
+    }
+
+    #[test]
+    fn a_row_is_mapped_as_its_pixels() {
+        let tone = Tone::new(&Response { coefficients: [0.3, -0.2, 0.1] }, 1.0, ENTRIES_PER_LEVEL);
+        let correction = correction(&tone, 0.4);
+        // Beyond both ends of the tables too; two whole blocks and a rest.
+        let level = |c: usize, i: usize| 8.37 * (i + 3 * c) as f32 - 20.0;
+        let lifts: Vec<f32> = (0..37).map(|i| 0.11 * i as f32 - 2.0).collect();
+        for fine in [false, true] {
+            let rows_of = |n: usize, first: usize| -> [Vec<f32>; 3] {
+                std::array::from_fn(|c| (first..first + n).map(|i| level(c, i)).collect())
+            };
+            let map = |rows: &mut [Vec<f32>; 3], lifts: &[f32]| {
+                let colors = rows.each_mut().map(|row| &mut row[..]);
+                let clipped = &mut vec![0.0; lifts.len()];
+                if fine {
+                    correction.row_of_levels::<true>(colors, lifts, clipped)
+                } else {
+                    correction.row_of_levels::<false>(colors, lifts, clipped)
+                }
+            };
+            let mut all = rows_of(37, 0);
+            map(&mut all, &lifts);
+            for i in 0..37 {
+                let mut one = rows_of(1, i);
+                map(&mut one, &lifts[i..=i]);
+                assert_eq!(one.map(|row| row[0]), [0, 1, 2].map(|c| all[c][i]), "{fine} {i}");
+            }
         }
     }
 

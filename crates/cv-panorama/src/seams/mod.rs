@@ -64,11 +64,14 @@ pub(crate) fn label_bounds(labels: &Image<u16, 1>, n: usize) -> Vec<Option<Bound
     bounds
 }
 
-/// Half width, in preview pixels, of the band around the seams of the halved preview in which the seams of the preview are found: a cut over the whole
-/// preview takes several times as long for hardly less energy.
-const BAND_RADIUS: usize = 4;
+/// Minimum number of pixels of the coarser resolutions in which the seams of the preview are found first: in fewer, objects that a seam must not cut are too
+/// small.
+const MIN_COARSE_PIXELS: usize = 10_000;
+/// Half width, in pixels of a resolution, of the band around the seams of the coarser one in which its seams are found: a cut over the whole preview takes
+/// several times as long for hardly less energy.
+const BAND_RADIUS: usize = 6;
 
-/// Finds the labels on the preview: unrestricted at half resolution, then in a band around those seams.
+/// Finds the labels on the preview: unrestricted at up to a quarter of its resolution, then in bands around the seams of the coarser resolution.
 pub(crate) fn on_preview(
     preview: &Preview,
     photo_of: &[usize],
@@ -78,58 +81,84 @@ pub(crate) fn on_preview(
     progress: &dyn Progress,
 ) -> Result<Image<u16, 1>, Cancelled> {
     let clipped = if radiance { CLIPPED_RADIANCE_COST } else { CLIPPED_COST };
-    let mut labels = voronoi(preview);
     if seams == Seams::Voronoi {
-        return Ok(labels);
+        return Ok(voronoi(preview));
     }
-    let stage = Stage::new(progress, "seams", 3)?;
+    let coarser = |level: &Preview| {
+        let half = (level.width / 2) * (level.height / 2) >= MIN_COARSE_PIXELS;
+        half.then(|| level.halved())
+    };
+    let half = coarser(preview);
+    let quarter = half.as_ref().and_then(coarser);
+    // From coarse to fine, with the side of a pixel in preview pixels.
+    let levels = [(quarter.as_ref(), 4), (half.as_ref(), 2), (Some(preview), 1)];
+    let levels: Vec<(&Preview, usize)> = levels.into_iter().filter_map(|(level, side)| Some((level?, side))).collect();
+
+    let stage = Stage::new(progress, "seams", 1 + levels.len())?;
     let found = Misalignments::find(preview, photo_of, &stage)?;
     stage.add(1)?;
     let pieces: Vec<Option<&WarpedPhoto>> = preview.pieces.iter().map(|p| Some(&p.warped)).collect();
-    let differ = |a: usize, b: usize, x: usize, y: usize| {
-        let off = preview.step as f32 * found.at(a, b, x, y) - 1.0;
-        difference(pieces[a], pieces[b], x, y) + (MISALIGNMENT_COST * off.clamp(0.0, MAX_MISALIGNMENT_PX)) as i32
-    };
-    let half = preview.halved();
-    let mut coarse = voronoi(&half);
-    // The maximum over four pixels: their mean would hide a thin object that the seam cuts.
-    let max_difference = |a: usize, b: usize, x: usize, y: usize| {
-        let four = [(0, 0), (1, 0), (0, 1), (1, 1)];
-        four.into_iter().map(|(i, j)| differ(a, b, 2 * x + i, 2 * y + j)).fold(0, i32::max)
-    };
-    // A pixel represents four, a unit of seam length two.
-    let half_transients = removes_transients.then(|| transient_costs(&half));
-    let pixel = |label: usize, x: usize, y: usize| {
-        let transient = transient_at(half_transients.as_deref(), &half, label, x, y);
-        (2.0 * (data_term(&half.pieces[label], clipped, x, y) + transient)) as i32
-    };
-    let reach: Vec<_> = half.pieces.iter().map(|p| Some(&p.warped)).collect();
-    // Further rounds hardly lower the energy.
-    let labeling = Labeling { photos: &reach, unary: pixel, difference: max_difference, free: |_, _| true };
-    labeling.expand(&mut coarse, 2, &stage)?;
-    stage.add(1)?;
+    let mut coarse: Option<Image<u16, 1>> = None;
+    for (level, side) in levels {
+        let (mut labels, near) = match &coarse {
+            None => (voronoi(level), None),
+            Some(coarse) => {
+                let labels = upsampled(coarse, level);
+                let near = seam_band(&labels, BAND_RADIUS, &stage)?;
+                (labels, Some(near))
+            }
+        };
+        // The maximum over 2 × 2 preview pixels: their mean would hide a thin object that the seam cuts. Of larger pixels the mean of these: their maximum is
+        // large almost everywhere.
+        let differ_within = |a: usize, b: usize, (left, top): (usize, usize), block: usize| {
+            let mut most = 0;
+            for (x, y) in (top..top + block).flat_map(|y| (left..left + block).map(move |x| (x, y))) {
+                let off = preview.step as f32 * found.at(a, b, x, y) - 1.0;
+                let misaligned = (MISALIGNMENT_COST * off.clamp(0.0, MAX_MISALIGNMENT_PX)) as i32;
+                most = most.max(difference(pieces[a], pieces[b], x, y) + misaligned);
+            }
+            most
+        };
+        let differ = |a: usize, b: usize, x: usize, y: usize| {
+            let (x, y) = (side * x, side * y);
+            match side {
+                4 => {
+                    let four = [(x, y), (x + 2, y), (x, y + 2), (x + 2, y + 2)];
+                    four.into_iter().map(|place| differ_within(a, b, place, 2)).sum::<i32>() / 4
+                }
+                _ => differ_within(a, b, (x, y), side),
+            }
+        };
+        let transients = removes_transients.then(|| transient_costs(level));
+        // A pixel represents `side²` preview pixels, a unit of seam length `side`.
+        let unary = |label: usize, x: usize, y: usize| {
+            let transient = transient_at(transients.as_deref(), level, label, x, y);
+            (side as f32 * (data_term(&level.pieces[label], clipped, x, y) + transient)) as i32
+        };
+        let reach: Vec<_> = level.pieces.iter().map(|p| Some(&p.warped)).collect();
+        let free = |x: usize, y: usize| near.as_ref().is_none_or(|near| near[y * level.width + x]);
+        // Further rounds hardly lower the energy.
+        let rounds = if coarse.is_none() { 2 } else { 1 };
+        Labeling { photos: &reach, unary, difference: differ, free }.expand(&mut labels, rounds, &stage)?;
+        coarse = Some(labels);
+        stage.add(1)?;
+    }
+    Ok(coarse.unwrap_or_else(|| voronoi(preview)))
+}
 
-    let width = preview.width;
+/// Labels the pixels of a level as those of half its resolution, where their photographs reach; others with the photograph whose center is nearest.
+fn upsampled(coarse: &Image<u16, 1>, level: &Preview) -> Image<u16, 1> {
+    let mut labels = voronoi(level);
     for (i, label) in labels.as_mut_slice().iter_mut().enumerate() {
-        let (x, y) = (i % width, i / width);
+        let (x, y) = (i % level.width, i / level.width);
         if let Some([found]) = coarse.get(x / 2, y / 2)
             && found != NO_PHOTO
-            && preview.pieces[usize::from(found)].warped.reaches(x, y)
+            && level.pieces[usize::from(found)].warped.reaches(x, y)
         {
             *label = found;
         }
     }
-    let near = seam_band(&labels, BAND_RADIUS, &stage)?;
-    let transients = removes_transients.then(|| transient_costs(preview));
-    let pixel = |label: usize, x: usize, y: usize| {
-        let transient = transient_at(transients.as_deref(), preview, label, x, y);
-        (data_term(&preview.pieces[label], clipped, x, y) + transient) as i32
-    };
-    let labeling =
-        Labeling { photos: &pieces, unary: pixel, difference: differ, free: |x: usize, y: usize| near[y * width + x] };
-    labeling.expand(&mut labels, 1, &stage)?;
-    stage.add(1)?;
-    Ok(labels)
+    labels
 }
 
 /// Labels every pixel with the photograph whose center is nearest.

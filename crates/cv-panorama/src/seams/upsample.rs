@@ -40,27 +40,41 @@ pub(crate) fn upsample_rows<T: Sample>(
     let columns: Vec<(usize, usize, f32)> = (0..w).map(|x| place(x, cw)).collect();
     for_each_row(labels.as_mut_slice(), w, stage, |y, row| {
         let (y0, y1, fy) = place(top + y, ch);
-        for (x, out) in row.iter_mut().enumerate() {
-            let (x0, x1, fx) = columns[x];
+        let mut left = 0;
+        // The pixels between two columns of the preview at a time: most are between four equal labels.
+        for run in columns.chunk_by(|a, b| a.0 == b.0) {
+            let (x0, x1, _) = run[0];
             let near = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)].map(|(x, y)| coarse.at(x, y)[0]);
             let first = near[0];
-            if first != NO_PHOTO && near.iter().all(|l| *l == first) && reaches(first, x, y) {
-                *out = first;
-                continue;
-            }
-            let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
-            let mut best = (0.0, NO_PHOTO);
-            for label in near {
-                let weight: f32 = near.iter().zip(weights).filter(|(l, _)| **l == label).map(|(_, w)| w).sum();
-                if label != NO_PHOTO && weight >= best.0 && weight > 0.0 && reaches(label, x, y) {
-                    best = (weight + 1e-6, label);
+            let is_uniform = first != NO_PHOTO && near.iter().all(|l| *l == first);
+            // The photograph's pixels from the left end of the run to its own last one.
+            let photo = photos.get(usize::from(first)).and_then(Option::as_ref).filter(|_| is_uniform);
+            let pixels = photo.and_then(|p| {
+                let b = p.bounds;
+                let is_row = b.top <= y && y < b.bottom && b.left <= left;
+                if is_row { p.pixels.row(y - b.top).get(4 * (left - b.left)..) } else { None }
+            });
+            let mut pixels = pixels.unwrap_or_default().as_chunks::<4>().0.iter();
+            for ((x, (_, _, fx)), out) in (left..).zip(run).zip(&mut row[left..]) {
+                if pixels.next().is_some_and(|pixel| pixel[3] != T::default()) {
+                    *out = first;
+                    continue;
                 }
+                let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
+                let mut best = (0.0, NO_PHOTO);
+                for label in near {
+                    let weight: f32 = near.iter().zip(weights).filter(|(l, _)| **l == label).map(|(_, w)| w).sum();
+                    if label != NO_PHOTO && weight >= best.0 && weight > 0.0 && reaches(label, x, y) {
+                        best = (weight + 1e-6, label);
+                    }
+                }
+                if best.1 == NO_PHOTO {
+                    let any = (0..photos.len() as u16).find(|&l| reaches(l, x, y));
+                    best.1 = any.unwrap_or(NO_PHOTO);
+                }
+                *out = best.1;
             }
-            if best.1 == NO_PHOTO {
-                let any = (0..photos.len() as u16).find(|&l| reaches(l, x, y));
-                best.1 = any.unwrap_or(NO_PHOTO);
-            }
-            *out = best.1;
+            left += run.len();
         }
     })?;
     Ok(labels)

@@ -68,6 +68,7 @@ impl DisplacementField {
     }
 
     /// Adds the offsets to the sampling positions of one canvas row that starts at column `left`.
+    #[inline(always)]
     pub(crate) fn add_row(&self, y: f64, left: f64, us: &mut [f32], vs: &mut [f32]) {
         let v = ((y - self.top) / self.spacing).clamp(0.0, self.rows as f64 - 1.0001);
         let (row, fy) = (v as usize * self.columns, v.fract() as f32);
@@ -77,17 +78,29 @@ impl DisplacementField {
         };
         let (start, step) = (((left - self.left) / self.spacing) as f32, (1.0 / self.spacing) as f32);
         let last = self.columns as f32 - 1.0001;
-        let mut cell = usize::MAX;
-        let (mut a, mut b) = ([0.0; 2], [0.0; 2]);
-        for (i, (u, v)) in us.iter_mut().zip(vs).enumerate() {
-            let x = (start + i as f32 * step).clamp(0.0, last);
-            if x as usize != cell {
-                cell = x as usize;
-                (a, b) = (vertex(cell), vertex(cell + 1));
+        let position = |i: usize| (start + i as i32 as f32 * step).max(0.0).min(last);
+        let mut first = 0;
+        // The pixels of a cell at a time, in a loop that is vectorized.
+        while first < us.len() {
+            let cell = position(first) as usize;
+            // To within rounding, and beyond the last cell not at all.
+            let mut end = (((cell + 1) as f32 - start) / step) as usize;
+            end = end.clamp(first + 1, us.len());
+            while end > first + 1 && position(end - 1) as usize != cell {
+                end -= 1;
             }
-            let f = x - cell as f32;
-            *u += a[0] + (b[0] - a[0]) * f;
-            *v += a[1] + (b[1] - a[1]) * f;
+            while end < us.len() && position(end) as usize == cell {
+                end += 1;
+            }
+            let (a, b) = (vertex(cell), vertex(cell + 1));
+            let slope = [b[0] - a[0], b[1] - a[1]];
+            let (us, vs) = (&mut us[first..end], &mut vs[first..end]);
+            for i in 0..us.len().min(vs.len()) {
+                let f = position(first + i) - cell as f32;
+                us[i] += a[0] + slope[0] * f;
+                vs[i] += a[1] + slope[1] * f;
+            }
+            first = end;
         }
     }
 

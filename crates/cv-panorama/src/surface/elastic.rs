@@ -9,7 +9,7 @@ use crate::masks::{PhotoMask, is_removed, is_removed_near};
 use crate::surface::structure_tensor::StructureTensor;
 use crate::surface::{DisplacementField, Layout, PAD, Placement, SEARCH_RADIUS, SEARCH_SIDE, Surface, Template};
 use cv_core::{Cancelled, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
-use cv_imgproc::bilinear_at;
+use cv_imgproc::{SAMPLE_LANES, bilinear_lanes};
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 use std::ops::Deref;
@@ -438,16 +438,15 @@ fn sample_patch(
     side: usize,
     values: &mut [f32],
 ) {
-    let (width, height) = photo.size();
-    let (right, bottom) = ((width - 2) as f32, (height - 2) as f32);
-    let view = photo.view();
+    let (mut us, mut vs) = ([0.0_f32; SAMPLE_LANES], [0.0_f32; SAMPLE_LANES]);
     for (j, row) in values.chunks_exact_mut(side).enumerate() {
         let (u0, v0) = (corner.x + uy.x * j as f32, corner.y + uy.y * j as f32);
-        for (i, value) in row.iter_mut().enumerate() {
-            let (u, v) = (u0 + ux.x * i as f32, v0 + ux.y * i as f32);
-            // Single-precision rounding may reach the last column or row.
-            let (x, y) = (u.min(right) as usize, v.min(bottom) as usize);
-            [*value] = bilinear_at(view, x, y, u - x as f32, v - y as f32);
+        for (first, values) in (0..).step_by(SAMPLE_LANES).zip(row.chunks_mut(SAMPLE_LANES)) {
+            for k in 0..SAMPLE_LANES {
+                let i = (first + k as i32) as f32;
+                (us[k], vs[k]) = (u0 + ux.x * i, v0 + ux.y * i);
+            }
+            values.copy_from_slice(&bilinear_lanes(photo, &us, &vs)[..values.len()]);
         }
     }
 }

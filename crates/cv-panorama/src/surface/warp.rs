@@ -78,7 +78,7 @@ pub(crate) fn warp<T: Channel>(
         pixels.as_mut_slice(),
         4 * width,
         stage,
-        || Row::new(width),
+        || Row::<T>::new(width),
         |buffer, y, row| {
             let whole = bounds.left..bounds.right;
             let span = settings.region.map_or(whole, |region| region.span(bounds.top + y));
@@ -216,20 +216,22 @@ impl Map {
 }
 
 /// Scratch buffers of a canvas row.
-struct Row {
+struct Row<T> {
     /// Photograph coordinates.
     us: Vec<f32>,
     vs: Vec<f32>,
+    opacities: Vec<T>,
     colors: [Vec<f32>; 3],
     /// Vignetting correction in stops.
     lifts: Vec<f32>,
     clipped: Vec<f32>,
 }
 
-impl Row {
+impl<T: Channel> Row<T> {
     fn new(width: usize) -> Self {
         let line = || vec![0.0; width];
-        Self { us: line(), vs: line(), colors: [line(), line(), line()], lifts: line(), clipped: line() }
+        let opacities = vec![T::default(); width];
+        Self { us: line(), vs: line(), opacities, colors: [line(), line(), line()], lifts: line(), clipped: line() }
     }
 }
 
@@ -239,7 +241,7 @@ impl Row {
 fn sample_row<S: Simd, T: Channel, I: Sampler>(
     simd: S,
     photo: ImageView<'_, T, 3>,
-    buffer: &mut Row,
+    buffer: &mut Row<T>,
     row: &mut [T],
     place: (usize, usize),
     correction: Option<ExposureCorrection<'_>>,
@@ -247,22 +249,22 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
     let n = row.len() / 4;
     let [us, vs, lifts, clipped] =
         [&mut buffer.us, &mut buffer.vs, &mut buffer.lifts, &mut buffer.clipped].map(|line| &mut line[..n]);
+    let opacities = &mut buffer.opacities[..n];
     let [reds, greens, blues] = buffer.colors.each_mut().map(|line| &mut line[..n]);
     let (right, bottom) = ((photo.width() - 1) as f32, (photo.height() - 1) as f32);
     let corner = 4.0 / ((right + 1.0).powi(2) + (bottom + 1.0).powi(2));
-    let (pixels, _) = row.as_chunks_mut::<4>();
-    for ((pixel, u), v) in pixels.iter_mut().zip(us.iter_mut()).zip(vs.iter_mut()) {
+    for ((opacity, u), v) in opacities.iter_mut().zip(us.iter_mut()).zip(vs.iter_mut()) {
         let inside = (*u >= -0.5) & (*v >= -0.5) & (*u <= right + 0.5) & (*v <= bottom + 0.5);
-        pixel[3] = if inside { T::OPAQUE } else { T::default() };
+        *opacity = if inside { T::OPAQUE } else { T::default() };
         // `max` first: it replaces NaN.
         (*u, *v) = (u.max(0.0).min(right), v.max(0.0).min(bottom));
     }
-    let places = pixels.iter().zip(us.iter().zip(vs.iter()));
+    let places = opacities.iter().zip(us.iter().zip(vs.iter()));
     for (((place, r), g), b) in places.zip(reds.iter_mut()).zip(greens.iter_mut()).zip(blues.iter_mut()) {
-        let (pixel, (&u, &v)) = place;
+        let (opacity, (&u, &v)) = place;
         // Outside the border the nearest pixel suffices.
         [*r, *g, *b] =
-            if pixel[3] != T::default() { I::sample(simd, photo, u, v) } else { Nearest::sample(simd, photo, u, v) };
+            if *opacity != T::default() { I::sample(simd, photo, u, v) } else { Nearest::sample(simd, photo, u, v) };
     }
     if let Some(correction) = &correction {
         for ((lift, &u), &v) in lifts.iter_mut().zip(us.iter()).zip(vs.iter()) {
@@ -272,11 +274,11 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
         scale([&mut *reds, &mut *greens, &mut *blues], 1.0 / T::PER_LEVEL);
         if T::LINEAR {
             let factors = correction.gain.map(f32::exp2);
-            for ((((pixel, r), g), b), lift) in
-                pixels.iter_mut().zip(reds.iter_mut()).zip(greens.iter_mut()).zip(blues.iter_mut()).zip(lifts.iter())
+            for ((((opacity, r), g), b), lift) in
+                opacities.iter_mut().zip(reds.iter_mut()).zip(greens.iter_mut()).zip(blues.iter_mut()).zip(lifts.iter())
             {
-                if pixel[3] != T::default() && r.max(*g).max(*b) >= correction.clipped {
-                    pixel[3] = T::from_f32(CLIPPED);
+                if *opacity != T::default() && r.max(*g).max(*b) >= correction.clipped {
+                    *opacity = T::from_f32(CLIPPED);
                 }
                 let lift = lift.exp2();
                 // The bicubic kernel overshoots at edges.
@@ -292,8 +294,9 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
         }
         scale([&mut *reds, &mut *greens, &mut *blues], T::PER_LEVEL);
     }
-    for (((pixel, &r), &g), &b) in pixels.iter_mut().zip(reds.iter()).zip(greens.iter()).zip(blues.iter()) {
-        [pixel[0], pixel[1], pixel[2]] = [T::from_f32(r), T::from_f32(g), T::from_f32(b)];
+    let colors = reds.iter().zip(greens.iter()).zip(blues.iter());
+    for ((pixel, ((&r, &g), &b)), &opacity) in row.as_chunks_mut::<4>().0.iter_mut().zip(colors).zip(opacities.iter()) {
+        *pixel = [T::from_f32(r), T::from_f32(g), T::from_f32(b), opacity];
     }
 }
 
