@@ -16,6 +16,9 @@ const THREADS: usize = 2;
 /// Real sets below `panorama` of the data, in which OpenCV registers all photographs.
 const SETS: [&str; 4] = ["weir", "umd-set1", "umd-set3", "carpark"];
 
+/// Runs of each system on a set, of which the fastest counts; of the large set there is one.
+const RUNS: usize = 3;
+
 /// Name of the generated set of large photographs.
 const LARGE: &str = "generated, 8 of 12 Mpx";
 
@@ -108,19 +111,22 @@ fn compare(
         .collect::<Result<Vec<f64>>>()
         .context("photographs")?;
     let means = (means.iter().copied().fold(f64::MAX, f64::min), means.iter().copied().fold(0.0, f64::max));
+    let runs = if name == LARGE { 1 } else { RUNS };
     let mut systems = Vec::new();
     let mut opencv: Option<Outcome> = None;
     for (system, mode) in [("OpenCV", "panorama"), ("OpenCV, scans", "scans")] {
         let out = folder.join(format!("opencv-{mode}.png"));
-        let output = Command::new(python)
-            .arg(scripts.join("panorama_opencv.py"))
-            .args([mode, &THREADS.to_string()])
-            .arg(&out)
-            .args(photographs)
-            .output()
-            .context("cannot start Python")?;
-        ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        let outcome: Outcome = serde_json::from_slice(&output.stdout)?;
+        let outcome = fastest(runs, || {
+            let output = Command::new(python)
+                .arg(scripts.join("panorama_opencv.py"))
+                .args([mode, &THREADS.to_string()])
+                .arg(&out)
+                .args(photographs)
+                .output()
+                .context("cannot start Python")?;
+            ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+            Ok(serde_json::from_slice(&output.stdout)?)
+        })?;
         opencv.get_or_insert(outcome.clone());
         systems.push((system, outcome));
     }
@@ -137,9 +143,21 @@ fn compare(
         Some(theirs) if theirs.used == photographs.len() => (pixels(theirs.size) / pixels(first.size)).sqrt(),
         _ => 1.0,
     };
-    let same = run_ours(python, program, &folder, photographs, scale.clamp(0.5, 2.0))?;
+    let same = fastest(runs, || run_ours(python, program, &folder, photographs, scale.clamp(0.5, 2.0)))?;
     systems.insert(0, ("ours", Outcome { mean: first.mean, ..same }));
     Ok(Compared { name, photographs: photographs.len(), means, systems })
+}
+
+/// Runs a system several times; returns the run with the least processor time.
+fn fastest(runs: usize, run: impl Fn() -> Result<Outcome>) -> Result<Outcome> {
+    let mut fastest = run()?;
+    for _ in 1..runs {
+        let next = run()?;
+        if next.cpu < fastest.cpu {
+            fastest = next;
+        }
+    }
+    Ok(fastest)
 }
 
 /// Runs Hugin or reads its cached result; `None` if it is not installed.
@@ -256,7 +274,7 @@ fn page(sets: &[Compared], truths: &[(&str, Truth)], checks: &[Check], load: &st
     versions.sort_unstable();
     versions.dedup();
     let mut text = format!(
-        "Written by `cargo xtask peers panorama`; one run, {THREADS} threads each, {}, {}. The same photographs for all, from the input files to the panorama's file, reading and writing \
+        "Written by `cargo xtask peers panorama`; one run, the fastest of {RUNS} for the small sets, {THREADS} threads each, {}, {}. The same photographs for all, from the input files to the panorama's file, reading and writing \
          included; ours on OpenCV's projection surface with the same number of pixels. OpenCV's time excludes the startup of Python; the load was {load} at the start of the run; Hugin runs the steps of its assistant, its figures are of an earlier run on this machine. \
          Level: mean gray level of the pixels that are not black; in parentheses the range of the photographs' means.\n\n\
          | set | system | used | size | level | processor s | wall s | peak MiB |\n|---|---|---|---|---|---|---|---|\n",

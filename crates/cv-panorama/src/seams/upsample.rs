@@ -40,41 +40,41 @@ pub(crate) fn upsample_rows<T: Sample>(
     let columns: Vec<(usize, usize, f32)> = (0..w).map(|x| place(x, cw)).collect();
     for_each_row(labels.as_mut_slice(), w, stage, |y, row| {
         let (y0, y1, fy) = place(top + y, ch);
-        let mut left = 0;
-        // The pixels between two columns of the preview at a time: most are between four equal labels.
-        for run in columns.chunk_by(|a, b| a.0 == b.0) {
-            let (x0, x1, _) = run[0];
-            let near = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)].map(|(x, y)| coarse.at(x, y)[0]);
+        let (upper, lower) = (coarse.row(y0), coarse.row(y1));
+        // The row of the photograph of a label, and its first column.
+        let pixels_of = |label: u16| {
+            let photo = photos.get(usize::from(label)).and_then(Option::as_ref);
+            let photo = photo.filter(|p| (p.bounds.top..p.bounds.bottom).contains(&y));
+            photo.map_or((0, &[][..]), |p| (p.bounds.left, p.pixels.row(y - p.bounds.top).as_chunks::<4>().0))
+        };
+        let mut last = NO_PHOTO;
+        let (mut first_column, mut pixels) = pixels_of(last);
+        for ((x, &(x0, x1, fx)), out) in columns.iter().enumerate().zip(row) {
+            let near = [upper[x0], upper[x1], lower[x0], lower[x1]];
             let first = near[0];
-            let is_uniform = first != NO_PHOTO && near.iter().all(|l| *l == first);
-            // The photograph's pixels from the left end of the run to its own last one.
-            let photo = photos.get(usize::from(first)).and_then(Option::as_ref).filter(|_| is_uniform);
-            let pixels = photo.and_then(|p| {
-                let b = p.bounds;
-                let is_row = b.top <= y && y < b.bottom && b.left <= left;
-                if is_row { p.pixels.row(y - b.top).get(4 * (left - b.left)..) } else { None }
-            });
-            let mut pixels = pixels.unwrap_or_default().as_chunks::<4>().0.iter();
-            for ((x, (_, _, fx)), out) in (left..).zip(run).zip(&mut row[left..]) {
-                if pixels.next().is_some_and(|pixel| pixel[3] != T::default()) {
+            if first != NO_PHOTO && near == [first; 4] {
+                if first != last {
+                    (first_column, pixels) = pixels_of(first);
+                    last = first;
+                }
+                if pixels.get(x.wrapping_sub(first_column)).is_some_and(|pixel| pixel[3] != T::default()) {
                     *out = first;
                     continue;
                 }
-                let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
-                let mut best = (0.0, NO_PHOTO);
-                for label in near {
-                    let weight: f32 = near.iter().zip(weights).filter(|(l, _)| **l == label).map(|(_, w)| w).sum();
-                    if label != NO_PHOTO && weight >= best.0 && weight > 0.0 && reaches(label, x, y) {
-                        best = (weight + 1e-6, label);
-                    }
-                }
-                if best.1 == NO_PHOTO {
-                    let any = (0..photos.len() as u16).find(|&l| reaches(l, x, y));
-                    best.1 = any.unwrap_or(NO_PHOTO);
-                }
-                *out = best.1;
             }
-            left += run.len();
+            let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
+            let mut best = (0.0, NO_PHOTO);
+            for label in near {
+                let weight: f32 = near.iter().zip(weights).filter(|(l, _)| **l == label).map(|(_, w)| w).sum();
+                if label != NO_PHOTO && weight >= best.0 && weight > 0.0 && reaches(label, x, y) {
+                    best = (weight + 1e-6, label);
+                }
+            }
+            if best.1 == NO_PHOTO {
+                let any = (0..photos.len() as u16).find(|&l| reaches(l, x, y));
+                best.1 = any.unwrap_or(NO_PHOTO);
+            }
+            *out = best.1;
         }
     })?;
     Ok(labels)

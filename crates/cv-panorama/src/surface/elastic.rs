@@ -38,6 +38,12 @@ const CELLS: f64 = 24.0;
 const SMOOTHNESS: f64 = 0.15;
 /// Weight of the damping term: a displacement decays over √(SMOOTHNESS / DAMPING) = 5 cells, a fifth of a photograph.
 const DAMPING: f64 = 0.006;
+/// Rounds of iteratively reweighted least squares.
+const ROUNDS: u32 = 5;
+/// Tolerance of the conjugate gradients in the last round: a thousandth of a pixel.
+const TOLERANCE: f64 = 1e-8;
+/// Tolerance in the rounds before, whose weights are of a wider loss.
+const ROUND_TOLERANCE: f64 = 1e-4;
 /// Maximum displacement of a tie point relative to the side of a photograph; larger ones are outliers.
 const MAX_DISPLACEMENT_RATIO: f64 = 0.04;
 
@@ -175,9 +181,9 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
     }
     let mut d: Vec<Vector2<f64>> = fields.iter().flat_map(|f| f.displacement.iter().copied()).collect();
     let left = |d: &[Vector2<f64>], t: &[(usize, f64); 8]| -> Vector2<f64> { t.iter().map(|&(i, w)| d[i] * w).sum() };
-    for round in 0..5 {
+    for round in 0..ROUNDS {
         // The scale shrinks from round to round (graduated non-convexity).
-        let scale = scale * f64::from(1 << (4 - round.min(4)));
+        let scale = scale * f64::from(1 << (ROUNDS - 1 - round));
         let weight = |(t, want, normal): &Term| {
             let residual = TiePoint::measured(*normal, left(&d, t) - want);
             1.0 / (1.0 + residual.norm_squared() / (scale * scale))
@@ -212,7 +218,8 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
                 diagonal[i] += axes * (c * c * w);
             }
         }
-        conjugate_gradients(apply, &right, &diagonal, &mut d, stage)?;
+        let tolerance = if round + 1 < ROUNDS { ROUND_TOLERANCE } else { TOLERANCE };
+        conjugate_gradients(apply, &right, &diagonal, &mut d, tolerance, stage)?;
     }
     for (f, offset) in fields.iter_mut().zip(&offsets) {
         let len = f.displacement.len();
@@ -221,12 +228,14 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
     Ok(())
 }
 
-/// Solves by conjugate gradients with Jacobi preconditioner, starting from `x`.
+/// Solves by conjugate gradients with Jacobi preconditioner, starting from `x`; ends at a squared residual of `tolerance` relative to the right-hand side, since
+/// the initial residual may be small.
 fn conjugate_gradients(
     apply: impl Fn(&[Vector2<f64>]) -> Vec<Vector2<f64>>,
     right: &[Vector2<f64>],
     diagonal: &[Vector2<f64>],
     x: &mut [Vector2<f64>],
+    tolerance: f64,
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
     let dot = |a: &[Vector2<f64>], b: &[Vector2<f64>]| -> f64 { a.iter().zip(b).map(|(a, b)| a.dot(b)).sum() };
@@ -237,15 +246,13 @@ fn conjugate_gradients(
     let mut z = scaled(&r);
     let mut direction = z.clone();
     let mut rz = dot(&r, &z);
-    // The tolerance is relative to the right-hand side, as the initial residual may be small.
     let whole = dot(right, &scaled(right));
     for iteration in 0..200 {
         // An iteration on a hundred thousand matches is some milliseconds.
         if iteration % 8 == 0 {
             stage.check()?;
         }
-        // Convergence tolerance: a thousandth of a pixel.
-        if rz <= 1e-8 * whole.max(1e-6) {
+        if rz <= tolerance * whole.max(1e-6) {
             break;
         }
         let product = apply(&direction);
@@ -640,7 +647,7 @@ mod tests {
         };
         let diagonal: Vec<Vector2<f64>> = (0..n).map(|i| Vector2::repeat(matrix[(i, i)])).collect();
         let mut x = vec![Vector2::new(0.5, -0.5); n];
-        conjugate_gradients(apply, &right, &diagonal, &mut x, &stage()).unwrap();
+        conjugate_gradients(apply, &right, &diagonal, &mut x, TOLERANCE, &stage()).unwrap();
         for axis in 0..2 {
             let b = DVector::from_iterator(n, right.iter().map(|r| r[axis]));
             let direct = matrix.clone().cholesky().unwrap().solve(&b);
