@@ -60,7 +60,7 @@ pub use morphology::{StructuringElement, close, dilate, erode, open};
 pub use pixel::Pixel;
 pub use pyramid::{gaussian_pyramid, pyr_down, pyr_up};
 pub use resize::{resize, resize_area};
-pub use sample::{bicubic_at, bicubic_rgb_at, bilinear_at, sample_bicubic, sample_bilinear};
+pub use sample::{bicubic_at, bicubic_rgb_at, bilinear_at, integer_and_fraction, sample_bicubic, sample_bilinear};
 pub use sample_lanes::{SAMPLE_LANES, bicubic_lanes, bilinear_lanes};
 pub use warp::{Border, Interpolation, RemapOptions, WarpError, remap, undistort, warp_perspective, warp_with};
 pub use warp_map::WarpMap;

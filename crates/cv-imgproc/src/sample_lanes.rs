@@ -1,7 +1,7 @@
 //! Interpolation of an 8-bit gray image at eight positions at once: a loop over the positions for each step, so that all but the loads are
 //! vectorized. For code that is compiled for an instruction set ([`fearless_simd::dispatch`]); the results are the same for each.
 
-use crate::sample::KEYS;
+use crate::sample::{KEYS, integer_and_fraction};
 use cv_core::GrayU8;
 
 /// Number of positions.
@@ -15,8 +15,8 @@ pub fn bilinear_lanes(image: &GrayU8, us: &[f32; SAMPLE_LANES], vs: &[f32; SAMPL
     if width < 2 || height < 2 {
         return [0.0; SAMPLE_LANES];
     }
-    let (xs, fx) = split([0.0, (width - 2) as f32, (width - 1) as f32], us);
-    let (ys, fy) = split([0.0, (height - 2) as f32, (height - 1) as f32], vs);
+    let (xs, fx) = split(0, width - 1, us);
+    let (ys, fy) = split(0, height - 1, vs);
     // Two pixels in the low bytes.
     let (mut above, mut below) = ([0_u32; SAMPLE_LANES], [0_u32; SAMPLE_LANES]);
     for k in 0..SAMPLE_LANES {
@@ -41,8 +41,8 @@ pub fn bicubic_lanes(image: &GrayU8, us: &[f32; SAMPLE_LANES], vs: &[f32; SAMPLE
     if width < 4 || height < 4 {
         return [0.0; SAMPLE_LANES];
     }
-    let (xs, fx) = split([1.0, (width - 3) as f32, (width - 2) as f32], us);
-    let (ys, fy) = split([1.0, (height - 3) as f32, (height - 2) as f32], vs);
+    let (xs, fx) = split(1, width - 2, us);
+    let (ys, fy) = split(1, height - 2, vs);
     // Four pixels of each row.
     let mut rows = [[0_u32; SAMPLE_LANES]; 4];
     for k in 0..SAMPLE_LANES {
@@ -68,22 +68,16 @@ pub fn bicubic_lanes(image: &GrayU8, us: &[f32; SAMPLE_LANES], vs: &[f32; SAMPLE
     values
 }
 
-/// Splits coordinates, clamped to the first and the last of `[first, last base, last]`, into base index and fraction of 0 to 1. Avoids the saturating
-/// conversion: at 1.5 · 2²³ the last bits of a float are its integer part.
+/// Splits coordinates, clamped to `first..=last`, into base index, `first` to `last - 1`, and fraction of 0 to 1.
 #[inline(always)]
-fn split(
-    [first, last_base, last]: [f32; 3],
-    values: &[f32; SAMPLE_LANES],
-) -> ([u32; SAMPLE_LANES], [f32; SAMPLE_LANES]) {
-    const SHIFT: f32 = 12_582_912.0;
+fn split(first: usize, last: usize, values: &[f32; SAMPLE_LANES]) -> ([i32; SAMPLE_LANES], [f32; SAMPLE_LANES]) {
     let (mut bases, mut fractions) = ([0; SAMPLE_LANES], [0.0; SAMPLE_LANES]);
     for k in 0..SAMPLE_LANES {
         // `max` first: it replaces NaN.
-        let v = values[k].max(first).min(last);
-        // Rounded to even: of an odd integer the base may be the one before, and the fraction 1.
-        let shifted = ((v - 0.5) + SHIFT).max(first + SHIFT).min(last_base + SHIFT);
-        bases[k] = shifted.to_bits() & 0x3f_ffff;
-        fractions[k] = v - (shifted - SHIFT);
+        let v = values[k].max(first as f32).min(last as f32);
+        let (base, _) = integer_and_fraction(v);
+        bases[k] = base.max(first as i32).min(last as i32 - 1);
+        fractions[k] = v - bases[k] as f32;
     }
     (bases, fractions)
 }
