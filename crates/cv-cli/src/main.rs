@@ -12,6 +12,9 @@ mod words;
 use clap::{CommandFactory, FromArgMatches, Parser};
 use frame::{Called, Globals};
 
+#[global_allocator]
+static ALLOCATOR: cv_alloc::ImageAllocator = cv_alloc::ImageAllocator;
+
 /// Classical computer vision: panoramas, structure from motion, stereo depth, calibration, matching and color segmentation.
 #[derive(Parser)]
 #[command(name = "cv", version, propagate_version = true, arg_required_else_help = true, max_term_width = 100)]

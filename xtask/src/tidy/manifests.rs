@@ -15,6 +15,7 @@ pub(super) type Table = Map<String, Value>;
 pub(super) struct Rules {
     pub(super) crates: BTreeMap<String, CrateRule>,
     only_in: BTreeMap<String, Vec<String>>,
+    unsafe_code: Vec<String>,
 }
 
 #[derive(Deserialize)]
@@ -67,7 +68,13 @@ pub(super) fn check_manifest(
     };
     let inherits =
         |value: Option<&Value>| value.and_then(|v| v.get("workspace")).and_then(Value::as_bool) == Some(true);
-    if !inherits(manifest.get("lints")) {
+    let lints = manifest.get("lints");
+    if rules.unsafe_code.contains(&name) {
+        let documented = lints.and_then(|v| v.get("clippy")).and_then(|v| v.get("undocumented_unsafe_blocks"));
+        if documented.and_then(Value::as_str) != Some("deny") {
+            found.problems.push(format!("{name}: Cargo.toml does not deny `clippy::undocumented_unsafe_blocks`"));
+        }
+    } else if !inherits(lints) {
         found.problems.push(format!("{name}: Cargo.toml lacks `[lints] workspace = true`"));
     }
     for key in ["version", "edition", "rust-version", "license"] {
