@@ -148,27 +148,22 @@ pub(crate) fn on_preview(
 
 /// Labels the pixels of a level as those of half its resolution, where their photographs reach; others with the photograph whose center is nearest.
 fn upsampled(coarse: &Image<u16, 1>, level: &Preview) -> Image<u16, 1> {
-    let mut labels = voronoi(level);
-    for (i, label) in labels.as_mut_slice().iter_mut().enumerate() {
-        let (x, y) = (i % level.width, i / level.width);
-        if let Some([found]) = coarse.get(x / 2, y / 2)
-            && found != NO_PHOTO
-            && level.pieces[usize::from(found)].warped.reaches(x, y)
-        {
-            *label = found;
-        }
-    }
-    labels
+    Image::from_fn(level.width, level.height, |x, y| match coarse.get(x / 2, y / 2) {
+        Some([found]) if found != NO_PHOTO && level.pieces[usize::from(found)].warped.reaches(x, y) => [found],
+        _ => [nearest(level, x, y)],
+    })
 }
 
 /// Labels every pixel with the photograph whose center is nearest.
 fn voronoi(preview: &Preview) -> Image<u16, 1> {
-    let (width, height) = (preview.width, preview.height);
-    Image::from_fn(width, height, |x, y| {
-        let reaching = preview.pieces.iter().enumerate().filter(|(_, p)| p.warped.reaches(x, y));
-        let nearest = reaching.map(|(i, p)| (eccentricity(p, x, y), i)).min_by(|a, b| a.0.total_cmp(&b.0));
-        [nearest.map_or(NO_PHOTO, |(_, i)| i as u16)]
-    })
+    Image::from_fn(preview.width, preview.height, |x, y| [nearest(preview, x, y)])
+}
+
+/// Returns the photograph whose center is nearest to a pixel; [`NO_PHOTO`] where none covers it.
+fn nearest(preview: &Preview, x: usize, y: usize) -> u16 {
+    let reaching = preview.pieces.iter().enumerate().filter(|(_, p)| p.warped.reaches(x, y));
+    let nearest = reaching.map(|(i, p)| (eccentricity(p, x, y), i)).min_by(|a, b| a.0.total_cmp(&b.0));
+    nearest.map_or(NO_PHOTO, |(_, i)| i as u16)
 }
 
 /// Data term of a pixel; `clipped` is the cost of a clipped one.
@@ -281,6 +276,9 @@ fn subsampled(photo: &WarpedPhoto) -> WarpedPhoto {
     WarpedPhoto { bounds, pixels }
 }
 
+/// Number of pixels of a row that [`seam_band`] compares at once.
+const RUN: usize = 32;
+
 /// Returns the mask of pixels within `reach` pixels (Chebyshev distance) of a seam.
 fn seam_band(labels: &Image<u16, 1>, reach: usize, stage: &Stage<'_>) -> Result<Vec<bool>, Cancelled> {
     let (w, h) = labels.size();
@@ -292,11 +290,20 @@ fn seam_band(labels: &Image<u16, 1>, reach: usize, stage: &Stage<'_>) -> Result<
         let differs = |a: u16, b: u16| a != b && a != NO_PHOTO && b != NO_PHOTO;
         // First column that is not marked yet.
         let mut marked = 0;
-        for x in 0..w {
-            if differs(own[x], below[x]) || x + 1 < w && differs(own[x], own[x + 1]) {
-                let end = (x + reach + 1).min(w);
-                near[marked.max(x.saturating_sub(reach))..end].fill(true);
-                marked = end;
+        for start in (0..w).step_by(RUN) {
+            let end = (start + RUN).min(w);
+            // Few runs of pixels have more than one label.
+            let beside = &own[start..(end + 1).min(w)];
+            let others = beside.iter().chain(&below[start..end]).fold(0, |bits, label| bits | (label ^ own[start]));
+            if others == 0 {
+                continue;
+            }
+            for x in start..end {
+                if differs(own[x], below[x]) || x + 1 < w && differs(own[x], own[x + 1]) {
+                    let end = (x + reach + 1).min(w);
+                    near[marked.max(x.saturating_sub(reach))..end].fill(true);
+                    marked = end;
+                }
             }
         }
     })?;

@@ -38,30 +38,14 @@ pub(crate) fn upsample_rows<T: Sample>(
         (i, (i + 1).min(n - 1), t - i as f32)
     };
     let columns: Vec<(usize, usize, f32)> = (0..w).map(|x| place(x, cw)).collect();
+    // First canvas column of each preview column.
+    let starts: Vec<usize> = (0..=cw).map(|i| columns.partition_point(|column| column.0 < i)).collect();
     for_each_row(labels.as_mut_slice(), w, stage, |y, row| {
         let (y0, y1, fy) = place(top + y, ch);
         let (upper, lower) = (coarse.row(y0), coarse.row(y1));
-        // The row of the photograph of a label, and its first column.
-        let pixels_of = |label: u16| {
-            let photo = photos.get(usize::from(label)).and_then(Option::as_ref);
-            let photo = photo.filter(|p| (p.bounds.top..p.bounds.bottom).contains(&y));
-            photo.map_or((0, &[][..]), |p| (p.bounds.left, p.pixels.row(y - p.bounds.top).as_chunks::<4>().0))
-        };
-        let mut last = NO_PHOTO;
-        let (mut first_column, mut pixels) = pixels_of(last);
-        for ((x, &(x0, x1, fx)), out) in columns.iter().enumerate().zip(row) {
+        let vote = |x: usize| {
+            let (x0, x1, fx) = columns[x];
             let near = [upper[x0], upper[x1], lower[x0], lower[x1]];
-            let first = near[0];
-            if first != NO_PHOTO && near == [first; 4] {
-                if first != last {
-                    (first_column, pixels) = pixels_of(first);
-                    last = first;
-                }
-                if pixels.get(x.wrapping_sub(first_column)).is_some_and(|pixel| pixel[3] != T::default()) {
-                    *out = first;
-                    continue;
-                }
-            }
             let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
             let mut best = (0.0, NO_PHOTO);
             for label in near {
@@ -74,7 +58,32 @@ pub(crate) fn upsample_rows<T: Sample>(
                 let any = (0..photos.len() as u16).find(|&l| reaches(l, x, y));
                 best.1 = any.unwrap_or(NO_PHOTO);
             }
-            *out = best.1;
+            best.1
+        };
+        let mut first = 0;
+        while first < cw {
+            // A run of preview columns of one label in both rows: between them nothing else is voted for.
+            let label = upper[first];
+            let same = |i: &usize| upper[*i] == label && lower[*i] == label;
+            let end = first + (first..cw).take_while(same).count().max(1);
+            let inner = if end == cw { cw } else { end - 1 };
+            let (left, right) = (starts[first], starts[inner]);
+            let photo = photos.get(usize::from(label)).and_then(Option::as_ref);
+            match photo.and_then(|photo| photo.opacities(left..right, y)) {
+                Some(mut opacities) => {
+                    if opacities.clone().all(|opacity| opacity != T::default()) {
+                        row[left..right].fill(label);
+                    } else {
+                        for x in left..right {
+                            let covers = opacities.next().is_some_and(|opacity| opacity != T::default());
+                            row[x] = if covers { label } else { vote(x) };
+                        }
+                    }
+                }
+                None => (left..right).for_each(|x| row[x] = vote(x)),
+            }
+            (right..starts[end]).for_each(|x| row[x] = vote(x));
+            first = end;
         }
     })?;
     Ok(labels)

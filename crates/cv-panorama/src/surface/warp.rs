@@ -12,6 +12,7 @@ use crate::surface::{Bounds, DisplacementField, Placement, Surface};
 use cv_core::{Cancelled, DistortionModel, Image, ImageView, Matrix3, Point2, Sample, Stage};
 use cv_imgproc::{Interpolation, bilinear_at};
 use fearless_simd::{Level, Simd, dispatch};
+use std::ops::Range;
 
 /// A photograph warped to a part of the canvas.
 #[derive(Debug, Clone, PartialEq)]
@@ -28,6 +29,14 @@ impl<T: Sample> WarpedPhoto<T> {
     pub fn reaches(&self, x: usize, y: usize) -> bool {
         let b = self.bounds;
         b.contains(x, y) && self.pixels.row(y - b.top)[4 * (x - b.left) + 3] != T::default()
+    }
+
+    /// Returns the opacities of a part of a canvas row; `None` if it is not within the bounds.
+    pub(crate) fn opacities(&self, columns: Range<usize>, y: usize) -> Option<impl Iterator<Item = T> + Clone> {
+        let b = self.bounds;
+        let is_inside = (b.top..b.bottom).contains(&y) && b.left <= columns.start && columns.end <= b.right;
+        let row = is_inside.then(|| self.pixels.row(y - b.top))?.as_chunks::<4>().0;
+        Some(row.get(columns.start - b.left..columns.end - b.left)?.iter().map(|pixel| pixel[3]))
     }
 
     /// Returns the color at a canvas pixel; `None` where the photograph does not cover it.
