@@ -43,11 +43,11 @@ impl<'a, T> PanoramaPhoto<'a, T> {
 /// Settings of [`panorama`].
 #[derive(Debug, Clone)]
 pub struct PanoramaOptions {
-    /// Features and matching. SIFT uses the upsampled octave ([`SiftOptions::upsample`]) and low-contrast features ([`SiftOptions::min_features`]) only where the photographs are not
-    /// connected by enough inliers without.
+    /// Features and matching. SIFT uses all of `registration_pixels`, the upsampled octave ([`SiftOptions::upsample`]) and low-contrast features ([`SiftOptions::min_features`]) only where the
+    /// photographs are not connected by enough inliers with half of the pixels and without the others.
     pub matching: MatchingOptions,
-    /// Approximate number of pixels to which photographs are resized for features and alignment. 10,000 or more; default 800,000, similar to OpenCV's stitcher
-    /// and Hugin's control point finders.
+    /// Approximate number of pixels to which photographs are resized for features and alignment, where inliers are localized by least-squares matching. 10,000 or more; default 800,000,
+    /// similar to OpenCV's stitcher and Hugin's control point finders.
     pub registration_pixels: usize,
     /// Verification of pairs. The threshold is in pixels of the resized photographs.
     pub verify: VerifyOptions,

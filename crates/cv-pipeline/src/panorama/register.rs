@@ -6,8 +6,9 @@ use crate::panorama::masked::{clip_removed, drop_removed};
 use crate::panorama::{
     LeftOut, NearestPair, PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto,
 };
-use cv_core::{Camera, Cancelled, GrayF32, GrayU8, RgbU8, Scaling, Stage, StageClock, UnionFind};
+use cv_core::{Camera, Cancelled, GrayF32, GrayU8, Image, ImageView, RgbU8, Scaling, Stage, StageClock, UnionFind};
 use cv_features::{FeatureError, FeatureOptions, Features, MatchError, SiftOptions};
+use cv_imgproc::Pixel;
 use cv_panorama::{
     AlignError, Alignment, PairRejection, Photo, PhotoMask, Unplaced, VerifiedPair, align, refine_alignment,
     verify_pair,
@@ -42,27 +43,30 @@ pub(super) fn register(
             prepared.extend(batch.collect::<Result<Vec<_>, _>>()?);
         }
     }
-    let mut extract_and_match =
-        |prepared: &mut [Prepared], matching: &MatchingOptions| -> Result<Vec<Option<MatchedPair>>, Cancelled> {
-            let stage = Stage::new(progress, "features", n)?;
-            prepared.par_iter_mut().try_for_each(|p| {
-                p.extract(matching, &stage)?;
-                stage.add(1)
-            })?;
-            clock.lap("features");
-            let prepared = &*prepared;
-            let stage = Stage::new(progress, "match", candidates.len())?;
-            let compare = |&(a, b): &(usize, usize)| -> Result<Option<MatchedPair>, Cancelled> {
-                let pair = try_pair(prepared, a, b, options, &stage)?;
-                stage.add(1)?;
-                Ok(pair)
-            };
-            let matched = candidates.par_iter().map(compare).collect::<Result<_, Cancelled>>()?;
-            clock.lap("match");
-            Ok(matched)
+    let mut extract_and_match = |prepared: &mut [Prepared],
+                                 matching: &MatchingOptions,
+                                 pixels: usize|
+     -> Result<Vec<Option<MatchedPair>>, Cancelled> {
+        let stage = Stage::new(progress, "features", n)?;
+        prepared.par_iter_mut().try_for_each(|p| {
+            p.extract(matching, pixels, &stage)?;
+            stage.add(1)
+        })?;
+        clock.lap("features");
+        let prepared = &*prepared;
+        let stage = Stage::new(progress, "match", candidates.len())?;
+        let compare = |&(a, b): &(usize, usize)| -> Result<Option<MatchedPair>, Cancelled> {
+            let pair = try_pair(prepared, a, b, options, &stage)?;
+            stage.add(1)?;
+            Ok(pair)
         };
+        let matched = candidates.par_iter().map(compare).collect::<Result<_, Cancelled>>()?;
+        clock.lap("match");
+        Ok(matched)
+    };
     let matching = &options.matching;
-    // The upsampled octave takes most of the time of SIFT, and low-contrast features are less accurate: both are used only where needed.
+    // SIFT at twice the resolution takes most of the time, and low-contrast features are less accurate: both are used only where needed. Matches are refined at the resolution of the
+    // registration in any case.
     let plain = match &matching.features {
         FeatureOptions::Sift(sift) if sift.upsample => {
             let features = FeatureOptions::Sift(SiftOptions { upsample: false, min_features: 0, ..sift.clone() });
@@ -70,9 +74,12 @@ pub(super) fn register(
         }
         _ => None,
     };
-    let mut matched = extract_and_match(&mut prepared, plain.as_ref().unwrap_or(matching))?;
+    let mut matched = match &plain {
+        Some(plain) => extract_and_match(&mut prepared, plain, options.registration_pixels / 2)?,
+        None => extract_and_match(&mut prepared, matching, usize::MAX)?,
+    };
     if plain.is_some() && !is_strongly_connected(n, &matched) {
-        matched = extract_and_match(&mut prepared, matching)?;
+        matched = extract_and_match(&mut prepared, matching, usize::MAX)?;
     }
     let (pairs, verified): (Vec<PanoramaPair>, Vec<Option<VerifiedPair>>) = matched.into_iter().flatten().unzip();
     let verified: Vec<VerifiedPair> = verified.into_iter().flatten().collect();
@@ -158,14 +165,9 @@ impl Prepared {
         stage.check()?;
         let filled = p.mask.map(|mask| mask.filled(p.image, stage)).transpose()?.flatten();
         let whole = filled.as_ref().map_or(p.image, RgbU8::view);
-        let (w, h) = whole.size();
-        let factor = ((w * h) as f64 / registration_pixels.max(10_000) as f64).sqrt().max(1.0);
-        let size = ((w as f64 / factor).round() as usize, (h as f64 / factor).round() as usize);
-        let reduced = (factor > 1.2).then(|| cv_imgproc::resize_area(whole, size.0, size.1).ok()).flatten();
-        let (image, factor) = match &reduced {
-            Some(small) => (small.view(), w as f64 / size.0 as f64),
-            None => (whole, 1.0),
-        };
+        let reduced = reduced(whole, registration_pixels);
+        let image = reduced.as_ref().map_or(whole, Image::view);
+        let factor = whole.width() as f64 / image.width() as f64;
         let (width, height) = image.size();
         let camera = p.camera.map(|c| Camera { width, height, ..c.scaled(1.0 / factor) });
         let photo = Photo { width, height, focal: p.focal.map(|f| f / factor), camera };
@@ -174,11 +176,16 @@ impl Prepared {
         Ok(Self { photo, factor, gray, features, failure: None, mask })
     }
 
-    /// Extracts the features.
-    fn extract(&mut self, matching: &MatchingOptions, progress: &dyn Progress) -> Result<(), Cancelled> {
+    /// Extracts the features at about `pixels` pixels.
+    fn extract(&mut self, matching: &MatchingOptions, pixels: usize, progress: &dyn Progress) -> Result<(), Cancelled> {
         let extractor = matching.features.extractor();
-        (self.features, self.failure) = match extractor.extract(self.gray.view(), progress) {
-            Ok(features) => (features, None),
+        let reduced = reduced(self.gray.view(), pixels);
+        let gray = reduced.as_ref().unwrap_or(&self.gray);
+        (self.features, self.failure) = match extractor.extract(gray.view(), progress) {
+            Ok(mut features) => {
+                rescale(&mut features, Scaling::uniform(self.gray.width() as f64 / gray.width() as f64));
+                (features, None)
+            }
             Err(FeatureError::Cancelled(stop)) => return Err(stop),
             Err(error) => (Features::new(extractor.kind()), Some(error)),
         };
@@ -203,6 +210,17 @@ impl Prepared {
         rescale(&mut self.features, Scaling::uniform(self.factor));
         self.features
     }
+}
+
+/// Minimum factor by which an image is reduced: less would save little.
+const MIN_REDUCTION: f64 = 1.2;
+
+/// Reduces an image to about `pixels` pixels (10,000 or more); `None` if it has hardly more.
+fn reduced<T: Pixel, const C: usize>(image: ImageView<'_, T, C>, pixels: usize) -> Option<Image<T, C>> {
+    let (w, h) = image.size();
+    let factor = ((w * h) as f64 / pixels.max(10_000) as f64).sqrt();
+    let size = ((w as f64 / factor).round() as usize, (h as f64 / factor).round() as usize);
+    (factor > MIN_REDUCTION).then(|| cv_imgproc::resize_area(image, size.0, size.1).ok()).flatten()
 }
 
 /// A matched pair, and the verified one if it was accepted.
