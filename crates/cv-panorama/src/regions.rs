@@ -1,6 +1,5 @@
 //! The parts of the canvas on which photographs are warped at full resolution.
 
-use crate::blend::NO_PHOTO;
 use crate::seams::label_bounds;
 use crate::surface::{Bounds, Layout, Preview};
 use cv_core::Image;
@@ -41,22 +40,32 @@ pub(crate) fn regions(
     #[allow(clippy::reversed_empty_ranges, reason = "an empty hull, which any column extends")]
     let none = vec![vec![usize::MAX..0; coarse.height()]; layout.placements.len()];
     let (mut own, mut fills) = (none.clone(), none);
-    let add = |spans: &mut [Vec<Range<usize>>], label: usize, x: usize, y: usize| {
-        if let Some(span) = spans.get_mut(label).and_then(|rows| rows.get_mut(y)) {
-            *span = span.start.min(x)..span.end.max(x + 1);
-        }
+    let add = |spans: &mut [Vec<Range<usize>>], label: usize, columns: Range<usize>, y: usize| {
+        let span = &mut spans[label][y];
+        *span = span.start.min(columns.start)..span.end.max(columns.end);
     };
     for y in 0..coarse.height() {
-        for (x, label) in coarse.row(y).iter().enumerate().filter(|(_, label)| **label != NO_PHOTO) {
-            add(&mut own, usize::from(*label), x, y);
+        let mut start = 0;
+        for run in coarse.row(y).chunk_by(|a, b| a == b) {
+            let columns = start..start + run.len();
+            start = columns.end;
+            let label = usize::from(run[0]);
+            let Some(piece) = preview.pieces.get(label) else { continue };
+            add(&mut own, label, columns.clone(), y);
             // At the border of a photograph, pixels of the canvas that it does not cover are taken from another.
-            let is_inside = |x: usize, y: usize| {
-                preview.pieces.get(usize::from(*label)).is_some_and(|piece| piece.warped.reaches(x, y))
+            let rows = [y.wrapping_sub(1), y, y + 1].map(|y| piece.warped.row(y));
+            let left = piece.warped.bounds.left;
+            let is_covered = |x: usize| {
+                rows.iter().all(|row| row.get(x.wrapping_sub(left)).is_some_and(|[.., opacity]| *opacity != 0))
             };
-            let around = |v: usize| [v.wrapping_sub(1), v, v + 1];
-            if around(y).iter().any(|v| around(x).iter().any(|u| !is_inside(*u, *v))) {
-                let others = preview.pieces.iter().enumerate().filter(|(_, piece)| piece.warped.reaches(x, y));
-                others.for_each(|(other, _)| add(&mut fills, other, x, y));
+            let mut before = [columns.start.wrapping_sub(1), columns.start].map(is_covered);
+            for x in columns {
+                let next = is_covered(x + 1);
+                if before != [true; 2] || !next {
+                    let others = preview.pieces.iter().enumerate().filter(|(_, piece)| piece.warped.reaches(x, y));
+                    others.for_each(|(other, _)| add(&mut fills, other, x..x + 1, y));
+                }
+                before = [before[1], next];
             }
         }
     }

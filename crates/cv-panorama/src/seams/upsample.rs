@@ -80,6 +80,7 @@ pub(crate) fn upsample_rows<T: Sample>(
                         }
                     }
                 }
+                None if label == NO_PHOTO => cover(&mut row[left..right], left, y, photos),
                 None => (left..right).for_each(|x| row[x] = vote(x)),
             }
             (right..starts[end]).for_each(|x| row[x] = vote(x));
@@ -87,6 +88,22 @@ pub(crate) fn upsample_rows<T: Sample>(
         }
     })?;
     Ok(labels)
+}
+
+/// Labels the pixels of row `y` from column `left`, which have no label, with the first photograph that covers them.
+fn cover<T: Sample>(labels: &mut [u16], left: usize, y: usize, photos: &[Option<WarpedPhoto<T>>]) {
+    for (name, photo) in photos.iter().enumerate().filter_map(|(name, photo)| Some((name, photo.as_ref()?))) {
+        let (start, end) = (left.max(photo.bounds.left), (left + labels.len()).min(photo.bounds.right));
+        if start >= end {
+            continue;
+        }
+        let Some(opacities) = photo.opacities(start..end, y) else { continue };
+        for (label, opacity) in labels[start - left..end - left].iter_mut().zip(opacities) {
+            if *label == NO_PHOTO && opacity != T::default() {
+                *label = name as u16;
+            }
+        }
+    }
 }
 
 #[cfg(test)]

@@ -31,12 +31,17 @@ impl<T: Sample> WarpedPhoto<T> {
         b.contains(x, y) && self.pixels.row(y - b.top)[4 * (x - b.left) + 3] != T::default()
     }
 
+    /// Returns the pixels of a canvas row within the bounds; empty above and below.
+    pub(crate) fn row(&self, y: usize) -> &[[T; 4]] {
+        let b = self.bounds;
+        if (b.top..b.bottom).contains(&y) { self.pixels.row(y - b.top).as_chunks::<4>().0 } else { &[] }
+    }
+
     /// Returns the opacities of a part of a canvas row; `None` if it is not within the bounds.
     pub(crate) fn opacities(&self, columns: Range<usize>, y: usize) -> Option<impl Iterator<Item = T> + Clone> {
-        let b = self.bounds;
-        let is_inside = (b.top..b.bottom).contains(&y) && b.left <= columns.start && columns.end <= b.right;
-        let row = is_inside.then(|| self.pixels.row(y - b.top))?.as_chunks::<4>().0;
-        Some(row.get(columns.start - b.left..columns.end - b.left)?.iter().map(|pixel| pixel[3]))
+        let left = self.bounds.left;
+        let part = columns.start.checked_sub(left)?..columns.end.checked_sub(left)?;
+        Some(self.row(y).get(part)?.iter().map(|pixel| pixel[3]))
     }
 
     /// Returns the color at a canvas pixel; `None` where the photograph does not cover it.
