@@ -62,22 +62,20 @@ pub(crate) fn upsample_rows<T: Sample>(
         };
         let mut first = 0;
         while first < cw {
-            // A run of preview columns of one label in both rows: between them nothing else is voted for.
+            // A run of preview columns of one label in both rows: between them nothing else is voted for. Right of the last, there is the next column, or the border.
             let label = upper[first];
-            let same = |i: &usize| upper[*i] == label && lower[*i] == label;
-            let end = first + (first..cw).take_while(same).count().max(1);
-            let inner = if end == cw { cw } else { end - 1 };
+            let run = (first..cw).take_while(|i| upper[*i] == label && lower[*i] == label).count();
+            let end = first + run.max(1);
+            let inner = if end == cw { first + run } else { end - 1 };
             let (left, right) = (starts[first], starts[inner]);
             let photo = photos.get(usize::from(label)).and_then(Option::as_ref);
             match photo.and_then(|photo| photo.opacities(left..right, y)) {
-                Some(mut opacities) => {
-                    if opacities.clone().all(|opacity| opacity != T::default()) {
-                        row[left..right].fill(label);
-                    } else {
-                        for x in left..right {
-                            let covers = opacities.next().is_some_and(|opacity| opacity != T::default());
-                            row[x] = if covers { label } else { vote(x) };
-                        }
+                Some(opacities) if opacities.clone().all(|opacity| opacity != T::default()) => {
+                    row[left..right].fill(label);
+                }
+                Some(opacities) => {
+                    for ((x, out), opacity) in (left..).zip(&mut row[left..right]).zip(opacities) {
+                        *out = if opacity != T::default() { label } else { vote(x) };
                     }
                 }
                 None if label == NO_PHOTO => cover(&mut row[left..right], left, y, photos),
@@ -127,6 +125,15 @@ mod tests {
                 assert_eq!(labels.at(x, y)[0], u16::from(off > 0.0), "{x} {y}");
             }
         }
+    }
+
+    #[test]
+    fn labels_of_two_rows_are_voted_for_in_every_column() {
+        let coarse = Image::from_fn(3, 2, |_, y| [y as u16]);
+        let whole = Bounds { left: 0, top: 0, right: 12, bottom: 8 };
+        let photos = [Some(drawn(whole, |_, _| [0; 3])), Some(drawn(whole, |_, _| [0; 3]))];
+        let labels = upsample(&coarse, 4, (12, 8), &photos, &stage()).unwrap();
+        assert!((0..8).all(|y| labels.row(y).iter().all(|label| usize::from(*label) == y / 4)), "{labels:?}");
     }
 
     #[test]
