@@ -46,7 +46,7 @@ const CLIPPED_RADIANCE_COST: f32 = 400.0;
 
 /// Smoothness term per canvas pixel of misalignment beyond the first, in addition to the color difference: 15 gray levels in one channel.
 const MISALIGNMENT_COST: f32 = 4.0 * 15.0;
-/// Misalignment beyond the first canvas pixel at which the cost is truncated: then it equals that of the border of a photograph. With the first, the search radius at full resolution.
+/// Misalignment beyond the first canvas pixel at which the cost is truncated: then it equals that of the border of a photograph.
 const MAX_MISALIGNMENT_PX: f32 = 3.0;
 
 /// Returns the bounding box of each of `n` labels.
