@@ -1,7 +1,7 @@
 //! Residual misalignment (parallax) of two photographs on the preview, by normalized cross-correlation of patches. A seam there cuts objects in two
 //! however similar the colors are.
 
-use crate::surface::{PAD, Piece, Preview, Template};
+use crate::surface::{PAD, Piece, Preview, SEARCH_RADIUS, SEARCH_SIDE, Template};
 use cv_core::{Cancelled, GrayF32, Stage, luma_f32};
 use rayon::prelude::*;
 
@@ -9,10 +9,6 @@ use rayon::prelude::*;
 const PATCH_RADIUS: usize = 4;
 /// Grid spacing of the patches in preview pixels.
 const SPACING: usize = 3;
-/// Search radius in preview pixels. Misalignments above four canvas pixels cost the same, but what looks alike within them may look more alike beyond.
-const SEARCH_RADIUS: usize = 8;
-/// Number of displacements along each axis.
-const SEARCH_SIDE: usize = 2 * SEARCH_RADIUS + 1;
 /// Minimum root mean square contrast of a patch, in gray levels: low-texture patches are skipped.
 const MIN_CONTRAST: f32 = 4.0;
 /// Minimum correlation of corresponding patches.
@@ -144,8 +140,7 @@ fn displacement(first: &GrayF32, p: (isize, isize), second: &GrayF32, q: (isize,
         let row = &second.row(y as usize)[left as usize..right as usize];
         window[start..start + row.len()].copy_from_slice(row);
     }
-    let scores = template.scores::<SEARCH_SIDE, { SEARCH_SIDE + PAD }>(&window);
-    let scores = scores.as_flattened();
+    let scores = template.scores(&window);
     // `max` passes over NaN.
     let best = scores.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     if best < MIN_CORRELATION {

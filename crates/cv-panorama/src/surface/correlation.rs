@@ -2,9 +2,14 @@
 
 use fearless_simd::{Level, dispatch};
 
-/// Displacements along a row that are computed in parallel beyond those of the search, whose results are ignored, and samples that follow a window for them: with these, rows of a search
-/// radius that is a multiple of four fill whole vectors of every instruction set.
-pub(crate) const PAD: usize = 7;
+/// Search radius, in pixels of the patch.
+pub(crate) const SEARCH_RADIUS: usize = 8;
+/// Number of displacements along each axis.
+pub(crate) const SEARCH_SIDE: usize = 2 * SEARCH_RADIUS + 1;
+/// Displacements along a row that are computed in parallel: fills whole vectors of every instruction set.
+const LANES: usize = 24;
+/// Padding after the last sample of a window, read by the lanes beyond [`SEARCH_SIDE`] and ignored.
+pub(crate) const PAD: usize = LANES - SEARCH_SIDE;
 
 /// A template: a zero-mean patch, row-major.
 pub(crate) struct Template {
@@ -39,16 +44,15 @@ impl Template {
         self.normalized(sum, squares, product)
     }
 
-    /// Computes the correlations with all positions of a window of side `self.side + SIDE − 1`, followed by [`PAD`] samples, row-major; equal to [`Self::score`] of each. `SIDE` is the number
-    /// of positions along each axis, `LANES` is `SIDE + PAD`.
-    pub(crate) fn scores<const SIDE: usize, const LANES: usize>(&self, window: &[f32]) -> [[f32; SIDE]; SIDE] {
-        const { assert!(SIDE >= 3 && LANES == SIDE + PAD) }
-        dispatch!(Level::new(), _simd => self.scores_inner::<SIDE, LANES>(window))
+    /// Computes the correlations with all positions of a window of side `side + 2 SEARCH_RADIUS`, followed by [`PAD`] samples, row-major; equal to
+    /// [`Self::score`] of each.
+    pub(crate) fn scores(&self, window: &[f32]) -> [f32; SEARCH_SIDE * SEARCH_SIDE] {
+        dispatch!(Level::new(), _simd => self.scores_inner(window))
     }
 
     #[inline(always)]
-    fn scores_inner<const SIDE: usize, const LANES: usize>(&self, window: &[f32]) -> [[f32; SIDE]; SIDE] {
-        let wide = self.side + SIDE - 1;
+    fn scores_inner(&self, window: &[f32]) -> [f32; SEARCH_SIDE * SEARCH_SIDE] {
+        let wide = self.side + 2 * SEARCH_RADIUS;
         assert_eq!(window.len(), wide * wide + PAD);
         let row = |r: usize| &window[r * wide..][..self.side - 1 + LANES];
         // Sums along each row of the window, which all vertical shifts share. (Arrays of their own, which stay in registers.)
@@ -63,10 +67,10 @@ impl Template {
             }
             along.push((sum, squares));
         }
-        let mut scores = [[0.0; SIDE]; SIDE];
+        let mut scores = [0.0; SEARCH_SIDE * SEARCH_SIDE];
         // Three shifts at a time, whose sums are independent; the last three may overlap those before.
-        for start in (0..SIDE).step_by(3) {
-            let start = start.min(SIDE - 3);
+        for start in (0..SEARCH_SIDE).step_by(3) {
+            let start = start.min(SEARCH_SIDE - 3);
             let mut products = [[0.0_f32; LANES]; 3];
             for (r, ours) in self.centered.chunks_exact(self.side).enumerate() {
                 let [first, second, third] = [0, 1, 2].map(|dy| row(r + start + dy).windows(LANES));
@@ -79,7 +83,9 @@ impl Template {
                     }
                 }
             }
-            for (dy, product) in (start..).zip(products) {
+            for ((dy, product), out) in
+                (start..).zip(products).zip(scores[start * SEARCH_SIDE..].chunks_exact_mut(SEARCH_SIDE))
+            {
                 let (mut sum, mut squares) = ([0.0_f32; LANES], [0.0_f32; LANES]);
                 for (row_sum, row_squares) in &along[dy..dy + self.side] {
                     for k in 0..LANES {
@@ -87,7 +93,7 @@ impl Template {
                         squares[k] += row_squares[k];
                     }
                 }
-                for (k, out) in scores[dy].iter_mut().enumerate() {
+                for (k, out) in out.iter_mut().enumerate() {
                     *out = self.normalized(sum[k], squares[k], product[k]);
                 }
             }
@@ -108,10 +114,6 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Positions of a search along each axis, and lanes.
-    const SIDE: usize = 17;
-    const LANES: usize = SIDE + PAD;
-
     /// Random gray levels, 0 to 256.
     fn gray_levels(mut state: u32) -> impl FnMut() -> f32 {
         move || {
@@ -124,7 +126,7 @@ mod tests {
         #[test]
         fn the_correlation_at_all_shifts_equals_that_at_single_shifts(half in 1_usize..9, seed in any::<u32>(), hole in 0_usize..2000) {
             let side = 2 * half + 1;
-            let wide = side + SIDE - 1;
+            let wide = side + 2 * SEARCH_RADIUS;
             let mut random = gray_levels(seed);
             let patch: Vec<f32> = (0..side * side).map(|_| random()).collect();
             let mut window: Vec<f32> = (0..wide * wide).map(|_| random()).collect();
@@ -133,9 +135,9 @@ mod tests {
             }
             window.resize(wide * wide + PAD, 0.0);
             let template = Template::new(side, &patch);
-            let scores = template.scores::<SIDE, LANES>(&window);
-            for (i, found) in scores.as_flattened().iter().enumerate() {
-                let (y, x) = (i / SIDE, i % SIDE);
+            let scores = template.scores(&window);
+            for (i, found) in scores.iter().enumerate() {
+                let (y, x) = (i / SEARCH_SIDE, i % SEARCH_SIDE);
                 let one = template.score((0..side).map(|r| &window[(y + r) * wide + x..][..side]));
                 prop_assert_eq!(found.to_bits(), one.to_bits());
                 prop_assert!(one.is_nan() || one.abs() < 1.0001);
@@ -144,18 +146,18 @@ mod tests {
 
         #[test]
         fn a_constant_window_correlates_with_nothing(level in 0_u8..=255, seed in any::<u32>()) {
-            let (side, wide) = (17, 17 + SIDE - 1);
+            let (side, wide) = (17, 17 + 2 * SEARCH_RADIUS);
             let mut random = gray_levels(seed);
             let patch: Vec<f32> = (0..side * side).map(|_| random()).collect();
-            let scores = Template::new(side, &patch).scores::<SIDE, LANES>(&vec![f32::from(level); wide * wide + PAD]);
+            let scores = Template::new(side, &patch).scores(&vec![f32::from(level); wide * wide + PAD]);
             // Rounding of 289 products of up to 128 · 255 levels², beside deviations of 74 and 0.3 levels.
-            prop_assert!(scores.as_flattened().iter().all(|score| score.abs() < 0.01), "{scores:?}");
+            prop_assert!(scores.iter().all(|score| score.abs() < 0.01), "{scores:?}");
         }
     }
 
     #[test]
     fn a_patch_has_its_maximum_correlation_at_its_position() {
-        let (side, wide) = (9, 9 + SIDE - 1);
+        let (side, wide) = (9, 9 + 2 * SEARCH_RADIUS);
         let mut window: Vec<f32> = (0..wide * wide)
             .map(|i| (i as u32).wrapping_mul(2_654_435_761).rotate_left(13).wrapping_mul(1_664_525) >> 24)
             .map(|v| v as f32)
@@ -165,11 +167,10 @@ mod tests {
         // Brighter and of less contrast: the correlation does not mind.
         let patch: Vec<f32> =
             (0..side * side).map(|i| 0.5 * window[(y + i / side) * wide + x + i % side] + 40.0).collect();
-        let scores = Template::new(side, &patch).scores::<SIDE, LANES>(&window);
-        let scores = scores.as_flattened();
+        let scores = Template::new(side, &patch).scores(&window);
         let best = (0..scores.len()).max_by(|a, b| scores[*a].total_cmp(&scores[*b]));
-        assert_eq!(best, Some(y * SIDE + x));
+        assert_eq!(best, Some(y * SEARCH_SIDE + x));
         // Rounding of some eighty sums.
-        assert!((scores[y * SIDE + x] - 1.0).abs() < 1e-4);
+        assert!((scores[y * SEARCH_SIDE + x] - 1.0).abs() < 1e-4);
     }
 }

@@ -7,7 +7,7 @@
 use crate::align::Alignment;
 use crate::masks::{PhotoMask, is_removed, is_removed_near};
 use crate::surface::structure_tensor::StructureTensor;
-use crate::surface::{DisplacementField, Layout, PAD, Placement, Surface, Template};
+use crate::surface::{DisplacementField, Layout, PAD, Placement, SEARCH_RADIUS, SEARCH_SIDE, Surface, Template};
 use cv_core::{Cancelled, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
 use cv_imgproc::{SAMPLE_LANES, bilinear_lanes};
 use fearless_simd::{Level, dispatch};
@@ -274,10 +274,6 @@ fn conjugate_gradients(
 
 /// Patch radius in canvas pixels.
 const PATCH_RADIUS: usize = 8;
-/// Search radius in canvas pixels.
-const SEARCH_RADIUS: usize = 8;
-/// Number of displacements along each axis.
-const SEARCH_SIDE: usize = 2 * SEARCH_RADIUS + 1;
 /// Radius in canvas pixels of what is compared with a patch.
 const WINDOW_RADIUS: usize = PATCH_RADIUS + SEARCH_RADIUS;
 /// Maximum number of patches per overlap.
@@ -511,8 +507,7 @@ const AMBIGUITY: f32 = 0.05;
 /// or ambiguous maximum.
 fn register(first: &[f32], mut second: Vec<f32>) -> Option<Vector2<f64>> {
     second.resize(second.len() + PAD, 0.0);
-    let scores = Template::new(2 * PATCH_RADIUS + 1, first).scores::<SEARCH_SIDE, { SEARCH_SIDE + PAD }>(&second);
-    let scores = scores.as_flattened();
+    let scores = Template::new(2 * PATCH_RADIUS + 1, first).scores(&second);
     let (best, &score) = scores.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
     let (y, x) = (best / SEARCH_SIDE, best % SEARCH_SIDE);
     if score < MIN_CORRELATION || x == 0 || y == 0 || x == SEARCH_SIDE - 1 || y == SEARCH_SIDE - 1 {

@@ -20,7 +20,7 @@ mod structure_tensor;
 mod warp;
 
 pub use bounds::Bounds;
-pub(crate) use correlation::{PAD, Template};
+pub(crate) use correlation::{PAD, SEARCH_RADIUS, SEARCH_SIDE, Template};
 pub(crate) use crop::{largest_rectangle, largest_rectangle_of};
 pub(crate) use displacement::DisplacementField;
 pub use displacement::PhotoMap;
