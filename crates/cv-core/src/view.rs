@@ -48,6 +48,12 @@ impl<'a, T: Sample, const C: usize> ImageView<'a, T, C> {
         &self.data[y * self.stride..y * self.stride + self.width * C]
     }
 
+    /// Returns the samples from the first of the first row to at least the last of the last row, and the stride. For loops that compute positions themselves.
+    #[inline]
+    pub fn strided_samples(&self) -> (&'a [T], usize) {
+        (self.data, self.stride)
+    }
+
     /// Returns the pixel at column `x`, row `y`.
     ///
     /// # Panics

@@ -20,6 +20,17 @@ pub trait Pixel: Sample {
     }
 }
 
+/// Rounds to the nearest integer of 0 to `last`, up to 2²²; halves up, and NaN to 0. For vectorized loops: avoids the saturating conversion, since at 2²³ the last bits
+/// of a float are its integer part.
+#[inline(always)]
+fn rounded(value: f32, last: f32) -> u32 {
+    const SHIFT: f32 = 8_388_608.0;
+    // `max` first: it replaces NaN.
+    let v = value.max(0.0).min(last) + 0.5;
+    let nearest = v + SHIFT;
+    (nearest.to_bits() & 0x7f_ffff) - u32::from(nearest - SHIFT > v)
+}
+
 impl Pixel for f32 {
     #[inline(always)]
     fn to_f32(self) -> f32 {
@@ -38,7 +49,7 @@ impl Pixel for u8 {
     }
     #[inline(always)]
     fn from_f32(value: f32) -> Self {
-        (value + 0.5) as u8
+        rounded(value, 255.0) as u8
     }
     #[inline(always)]
     fn as_bytes<const C: usize>(view: ImageView<'_, Self, C>) -> Option<ImageView<'_, u8, C>> {
@@ -57,6 +68,22 @@ impl Pixel for u16 {
     }
     #[inline(always)]
     fn from_f32(value: f32) -> Self {
-        (value + 0.5) as u16
+        rounded(value, 65535.0) as u16
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn samples_are_rounded_to_the_nearest_and_saturate(bits in any::<u32>(), halves in -10..140_000_i32, level in -2.0_f32..258.0) {
+            for v in [f32::from_bits(bits), halves as f32 / 2.0, level] {
+                prop_assert_eq!(u8::from_f32(v), (v + 0.5) as u8, "{}", v);
+                prop_assert_eq!(u16::from_f32(v), (v + 0.5) as u16, "{}", v);
+            }
+        }
     }
 }

@@ -2,7 +2,6 @@
 
 use crate::Pixel;
 use cv_core::ImageView;
-use fearless_simd::{f32x4, f32x16, i32x16, prelude::*, u8x16};
 
 /// Tolerance in pixels for points outside the outermost pixel centers, which are clamped to them: the rounding of an `f32` map of
 /// a few thousand pixels.
@@ -106,19 +105,6 @@ fn keys_weights(t: f32) -> [f32; 4] {
     weights
 }
 
-/// As [`keys_weights`], in one vector.
-#[inline(always)]
-fn keys_weights_in_vector<S: Simd>(simd: S, t: f32) -> [f32; 4] {
-    let t = f32x4::splat(simd, t);
-    let mut weights = f32x4::from_slice(simd, &KEYS[0]);
-    for coefficients in &KEYS[1..] {
-        weights = weights * t + f32x4::from_slice(simd, coefficients);
-    }
-    let mut array = [0.0; 4];
-    weights.store_slice(&mut array);
-    array
-}
-
 /// Interpolates bicubically from the base pixel `(ix, iy)`, which must be in the image, by the fractions `fx`, `fy` in 0 to 1; see
 /// [`sample_bicubic`]. For loops that compute base pixels and fractions themselves. Vertical first, so that rows of samples vectorize.
 #[inline(always)]
@@ -155,54 +141,10 @@ pub fn bicubic_at<T: Pixel, const C: usize>(
     value
 }
 
-/// As [`bicubic_at`] with identical results, for 8-bit RGB: the four pixels of a row in one vector of 16 bytes, of which four are unused.
-#[inline(always)]
-pub fn bicubic_rgb_at<S: Simd>(
-    simd: S,
-    view: ImageView<'_, u8, 3>,
-    ix: usize,
-    iy: usize,
-    fx: f32,
-    fy: f32,
-) -> [f32; 3] {
-    let near_border = ix < 1 || iy < 1 || iy + 2 >= view.height() || ix + 4 >= view.width();
-    if near_border {
-        return bicubic_near_border(view, ix, iy, fx, fy);
-    }
-    let (wx, wy) = (keys_weights_in_vector(simd, fx), keys_weights_in_vector(simd, fy));
-    // No closures: they would not be inlined, nor would the vector operations in them.
-    let mut sums = f32x16::splat(simd, 0.0);
-    for (j, wy) in wy.into_iter().enumerate() {
-        let bytes = u8x16::from_slice(simd, &view.row(iy + j - 1)[3 * ix - 3..3 * ix + 13]);
-        let (low, high) = bytes.widen();
-        let (low, high) = low.combine(high).widen();
-        // As signed integers, which unlike unsigned ones every instruction set converts.
-        let samples = low.combine(high).bitcast::<i32x16<S>>();
-        sums += samples.to_float::<f32x16<S>>() * f32x16::splat(simd, wy);
-    }
-    // Each pixel's three samples moved to the first lanes. (A load from an array of all of them would wait for its stores.)
-    let (low, high) = sums.split();
-    let ((a, b), (c, d)) = (low.split(), high.split());
-    let sum = a * f32x4::splat(simd, wx[0])
-        + a.slide::<3>(b) * f32x4::splat(simd, wx[1])
-        + b.slide::<2>(c) * f32x4::splat(simd, wx[2])
-        + c.slide::<1>(d) * f32x4::splat(simd, wx[3]);
-    let mut value = [0.0; 4];
-    sum.store_slice(&mut value);
-    [value[0], value[1], value[2]]
-}
-
-#[cold]
-#[inline(never)]
-fn bicubic_near_border(view: ImageView<'_, u8, 3>, ix: usize, iy: usize, fx: f32, fy: f32) -> [f32; 3] {
-    bicubic_at(view, ix, iy, fx, fy)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cv_core::{GrayF32, GrayU8, Image, RgbU8};
-    use fearless_simd::{Level, dispatch};
+    use cv_core::{GrayF32, GrayU8, Image};
     use proptest::prelude::*;
 
     #[test]
@@ -227,13 +169,6 @@ mod tests {
                 let got = sample_bicubic(image.view(), x, y).unwrap();
                 prop_assert!((f64::from(got[0]) - expected).abs() < 2e-5 && (f64::from(got[1]) - x * y).abs() < 2e-5);
             }
-        }
-
-        #[test]
-        fn vectorized_bicubic_equals_the_scalar_one(ix in 0_usize..12, iy in 0_usize..7, fx in 0.0f32..1.0, fy in 0.0f32..1.0) {
-            let image = RgbU8::from_fn(12, 7, |x, y| [0, 1, 2].map(|c| ((37 * x + 59 * y + 83 * c) * (x + 3 * c + 1) % 256) as u8));
-            let fast = dispatch!(Level::new(), simd => bicubic_rgb_at(simd, image.view(), ix, iy, fx, fy));
-            prop_assert_eq!(fast, bicubic_at(image.view(), ix, iy, fx, fy));
         }
 
         #[test]

@@ -1,8 +1,9 @@
-//! Interpolation of an 8-bit gray image at eight positions at once: a loop over the positions for each step, so that all but the loads are
+//! Interpolation of an 8-bit image at eight positions at once: a loop over the positions for each step, so that all but the loads are
 //! vectorized. For code that is compiled for an instruction set ([`fearless_simd::dispatch`]); the results are the same for each.
 
 use crate::sample::{KEYS, integer_and_fraction};
-use cv_core::GrayU8;
+use cv_core::{GrayU8, ImageView};
+use fearless_simd::{f32x4, f32x16, i32x16, prelude::*, u8x16};
 
 /// Number of positions.
 pub const SAMPLE_LANES: usize = 8;
@@ -68,6 +69,60 @@ pub fn bicubic_lanes(image: &GrayU8, us: &[f32; SAMPLE_LANES], vs: &[f32; SAMPLE
     values
 }
 
+/// Interpolates an RGB image by cubic convolution at `(us[k], vs[k])` in pixels; returns the channels, equal to [`crate::bicubic_at`] of each position. `None`
+/// unless all positions are inside `(1, w − 4) × (1, h − 2)`, in an image of up to 2²² rows and columns.
+///
+/// The four pixels of a row are loaded as one vector of 16 bytes, of which four are unused.
+#[inline(always)]
+pub fn bicubic_rgb_lanes<S: Simd>(
+    simd: S,
+    view: ImageView<'_, u8, 3>,
+    us: &[f32; SAMPLE_LANES],
+    vs: &[f32; SAMPLE_LANES],
+) -> Option<[[f32; SAMPLE_LANES]; 3]> {
+    let (right, bottom) = (view.width() as f32 - 4.0, view.height() as f32 - 2.0);
+    let mut inside = right.max(bottom) <= (1 << 22) as f32;
+    let (mut xs, mut ys) = ([0; SAMPLE_LANES], [0; SAMPLE_LANES]);
+    let (mut fx, mut fy) = ([0.0; SAMPLE_LANES], [0.0; SAMPLE_LANES]);
+    for k in 0..SAMPLE_LANES {
+        inside &= (us[k] > 1.0) & (us[k] < right) & (vs[k] > 1.0) & (vs[k] < bottom);
+        (xs[k], fx[k]) = integer_and_fraction(us[k]);
+        (ys[k], fy[k]) = integer_and_fraction(vs[k]);
+    }
+    if !inside {
+        return None;
+    }
+    let (wx, wy) = (keys_lanes(&fx), keys_lanes(&fy));
+    let (samples, stride) = view.strided_samples();
+    let mut values = [[0.0; SAMPLE_LANES]; 3];
+    for k in 0..SAMPLE_LANES {
+        let mut rows = samples.get((ys[k] as usize - 1) * stride + 3 * (xs[k] as usize - 1)..)?;
+        let mut sums = f32x16::splat(simd, 0.0);
+        // No closures: they would not be inlined, nor would the vector operations in them.
+        for (j, wy) in wy.iter().enumerate() {
+            if j > 0 {
+                rows = rows.get(stride..)?;
+            }
+            let (low, high) = u8x16::from_slice(simd, rows.first_chunk::<16>()?).widen();
+            let (low, high) = low.combine(high).widen();
+            // As signed integers, which unlike unsigned ones every instruction set converts.
+            let samples = low.combine(high).bitcast::<i32x16<S>>();
+            sums += samples.to_float::<f32x16<S>>() * f32x16::splat(simd, wy[k]);
+        }
+        // Each pixel's three samples moved to the first lanes. (A load from an array of all of them would wait for its stores.)
+        let (low, high) = sums.split();
+        let ((a, b), (c, d)) = (low.split(), high.split());
+        let sum = a * f32x4::splat(simd, wx[0][k])
+            + a.slide::<3>(b) * f32x4::splat(simd, wx[1][k])
+            + b.slide::<2>(c) * f32x4::splat(simd, wx[2][k])
+            + c.slide::<1>(d) * f32x4::splat(simd, wx[3][k]);
+        for (c, values) in values.iter_mut().enumerate() {
+            values[k] = sum[c];
+        }
+    }
+    Some(values)
+}
+
 /// Splits coordinates, clamped to `first..=last`, into base index, `first` to `last - 1`, and fraction of 0 to 1.
 #[inline(always)]
 fn split(first: usize, last: usize, values: &[f32; SAMPLE_LANES]) -> ([i32; SAMPLE_LANES], [f32; SAMPLE_LANES]) {
@@ -105,6 +160,7 @@ fn keys_lanes(fractions: &[f32; SAMPLE_LANES]) -> [[f32; SAMPLE_LANES]; 4] {
 mod tests {
     use super::*;
     use crate::{bicubic_at, bilinear_at};
+    use cv_core::RgbU8;
     use fearless_simd::{Level, dispatch};
     use proptest::prelude::*;
 
@@ -132,6 +188,45 @@ mod tests {
                 prop_assert_eq!(linear[k], bilinear_at(image.view(), x, y, fx, fy)[0]);
                 prop_assert_eq!(cubic[k], bicubic_at(image.view(), x, y, fx, fy)[0]);
             }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn colors_equal_single_pixels(u in -1.0_f32..9.0, v in -1.0_f32..5.0, du in proptest::array::uniform8(0.0_f32..1.0), dv in proptest::array::uniform8(0.0_f32..1.0), integers in any::<bool>()) {
+            let whole = RgbU8::from_fn(13, 9, |x, y| [0, 1, 2].map(|c| ((37 * x + 59 * y + 83 * c) * (x + 3 * c + 1) % 256) as u8));
+            // A part of an image, whose rows are not contiguous.
+            let view = whole.view().crop(2, 1, 10, 7).unwrap();
+            let (mut us, mut vs) = (at(u, du), at(v, dv));
+            if integers {
+                (us, vs) = (us.map(f32::round), vs.map(f32::round));
+            }
+            let inside = us.iter().all(|u| (1.0..6.0).contains(u) && *u > 1.0) && vs.iter().all(|v| (1.0..5.0).contains(v) && *v > 1.0);
+            let found = dispatch!(Level::new(), simd => bicubic_rgb_lanes(simd, view, &us, &vs));
+            prop_assert_eq!(found.is_some(), inside);
+            for k in 0..SAMPLE_LANES {
+                let Some(found) = found else { break };
+                let ((x, fx), (y, fy)) = (parts(us[k]), parts(vs[k]));
+                prop_assert_eq!(found.map(|channel| channel[k]), bicubic_at(view, x, y, fx, fy));
+            }
+        }
+    }
+
+    #[test]
+    fn positions_near_the_border_or_nowhere_are_not_interpolated() {
+        let image = RgbU8::new(20, 20, [7, 80, 255]);
+        let inside = [5.0; SAMPLE_LANES];
+        let all = |us: &[f32; SAMPLE_LANES]| dispatch!(Level::new(), simd => bicubic_rgb_lanes(simd, image.view(), us, &inside));
+        assert_eq!(all(&inside), Some([[7.0; SAMPLE_LANES], [80.0; SAMPLE_LANES], [255.0; SAMPLE_LANES]]));
+        for u in [f32::NAN, f32::INFINITY, -1e9, 0.0, 1.0, 16.0, 19.0, 1e9] {
+            let mut us = inside;
+            us[3] = u;
+            assert_eq!(all(&us), None, "{u}");
+        }
+        for (width, height) in [(0, 0), (4, 20), (20, 3)] {
+            let small = RgbU8::new(width, height, [1; 3]);
+            let found = dispatch!(Level::new(), simd => bicubic_rgb_lanes(simd, small.view(), &inside, &inside));
+            assert_eq!(found, None);
         }
     }
 

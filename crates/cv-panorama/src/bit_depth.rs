@@ -11,7 +11,7 @@ use crate::rows::for_each_row;
 use crate::stream::{MemoryLimit, PhotoSource, RowSink, draw_streamed};
 use crate::surface::{WarpedPhoto, downsample_box};
 use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Stage};
-use cv_imgproc::{Pixel, bicubic_at, bicubic_rgb_at, resize_area};
+use cv_imgproc::{Pixel, SAMPLE_LANES, bicubic_rgb_lanes, resize_area};
 use fearless_simd::Simd;
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -31,6 +31,12 @@ impl PhotoSample for u16 {
     const WHITE: Self = 65535;
 }
 
+/// One coordinate, in pixels, of the positions that are interpolated at once.
+pub(crate) type Positions<'a> = &'a [f32; SAMPLE_LANES];
+
+/// The three channels at these positions.
+pub(crate) type Colors = [[f32; SAMPLE_LANES]; 3];
+
 /// Sample type of warped photographs: a [`PhotoSample`], or linear radiance in `f32`.
 pub trait Channel: Pixel {
     /// Opacity where a photograph covers a pixel.
@@ -46,8 +52,11 @@ pub trait Channel: Pixel {
 
     fn widened(self) -> Self::Sum;
 
-    /// [`cv_imgproc::bicubic_at`].
-    fn bicubic<S: Simd>(simd: S, view: ImageView<'_, Self, 3>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3];
+    /// [`bicubic_rgb_lanes`], where it has the type.
+    #[inline(always)]
+    fn bicubic_lanes<S: Simd>(_: S, _: ImageView<'_, Self, 3>, _: Positions<'_>, _: Positions<'_>) -> Option<Colors> {
+        None
+    }
 }
 
 /// Internal operations of a [`PhotoSample`].
@@ -145,8 +154,13 @@ impl Channel for u8 {
     }
 
     #[inline(always)]
-    fn bicubic<S: Simd>(simd: S, view: ImageView<'_, Self, 3>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3] {
-        bicubic_rgb_at(simd, view, x, y, fx, fy)
+    fn bicubic_lanes<S: Simd>(
+        simd: S,
+        view: ImageView<'_, u8, 3>,
+        us: Positions<'_>,
+        vs: Positions<'_>,
+    ) -> Option<Colors> {
+        bicubic_rgb_lanes(simd, view, us, vs)
     }
 }
 
@@ -230,11 +244,6 @@ impl Channel for u16 {
     fn widened(self) -> u32 {
         u32::from(self)
     }
-
-    #[inline(always)]
-    fn bicubic<S: Simd>(_: S, view: ImageView<'_, Self, 3>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3] {
-        bicubic_at(view, x, y, fx, fy)
-    }
 }
 
 impl Channel for f32 {
@@ -247,11 +256,6 @@ impl Channel for f32 {
     #[inline(always)]
     fn widened(self) -> f32 {
         self
-    }
-
-    #[inline(always)]
-    fn bicubic<S: Simd>(_: S, view: ImageView<'_, Self, 3>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3] {
-        bicubic_at(view, x, y, fx, fy)
     }
 }
 

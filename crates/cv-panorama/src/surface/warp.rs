@@ -4,13 +4,13 @@
 //! multiply-adds per coordinate and one division.
 
 use crate::align::View;
-use crate::bit_depth::Channel;
+use crate::bit_depth::{Channel, Colors, Positions};
 use crate::photometric::ExposureCorrection;
 use crate::regions::Region;
 use crate::rows::for_each_row_with;
 use crate::surface::{Bounds, DisplacementField, Placement, Surface};
 use cv_core::{Cancelled, DistortionModel, Image, ImageView, Matrix3, Point2, Sample, Stage};
-use cv_imgproc::{Interpolation, bilinear_at};
+use cv_imgproc::{Interpolation, SAMPLE_LANES, bicubic_at, bilinear_at};
 use fearless_simd::{Level, Simd, dispatch};
 use std::ops::Range;
 
@@ -92,7 +92,7 @@ pub(crate) fn warp<T: Channel>(
         pixels.as_mut_slice(),
         4 * width,
         stage,
-        || Row::<T>::new(width),
+        || Row::new(width),
         |buffer, y, row| {
             let whole = bounds.left..bounds.right;
             let span = settings.region.map_or(whole, |region| region.span(bounds.top + y));
@@ -230,22 +230,28 @@ impl Map {
 }
 
 /// Scratch buffers of a canvas row.
-struct Row<T> {
+struct Row {
     /// Photograph coordinates.
     us: Vec<f32>,
     vs: Vec<f32>,
-    opacities: Vec<T>,
+    opacities: Vec<f32>,
     colors: [Vec<f32>; 3],
     /// Vignetting correction in stops.
     lifts: Vec<f32>,
     clipped: Vec<f32>,
 }
 
-impl<T: Channel> Row<T> {
+impl Row {
     fn new(width: usize) -> Self {
         let line = || vec![0.0; width];
-        let opacities = vec![T::default(); width];
-        Self { us: line(), vs: line(), opacities, colors: [line(), line(), line()], lifts: line(), clipped: line() }
+        Self {
+            us: line(),
+            vs: line(),
+            opacities: line(),
+            colors: [line(), line(), line()],
+            lifts: line(),
+            clipped: line(),
+        }
     }
 }
 
@@ -255,7 +261,7 @@ impl<T: Channel> Row<T> {
 fn sample_row<S: Simd, T: Channel, I: Sampler>(
     simd: S,
     photo: ImageView<'_, T, 3>,
-    buffer: &mut Row<T>,
+    buffer: &mut Row,
     row: &mut [T],
     place: (usize, usize),
     correction: Option<ExposureCorrection<'_>>,
@@ -269,16 +275,29 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
     let corner = 4.0 / ((right + 1.0).powi(2) + (bottom + 1.0).powi(2));
     for ((opacity, u), v) in opacities.iter_mut().zip(us.iter_mut()).zip(vs.iter_mut()) {
         let inside = (*u >= -0.5) & (*v >= -0.5) & (*u <= right + 0.5) & (*v <= bottom + 0.5);
-        *opacity = if inside { T::OPAQUE } else { T::default() };
+        *opacity = if inside { T::OPAQUE.to_f32() } else { 0.0 };
         // `max` first: it replaces NaN.
         (*u, *v) = (u.max(0.0).min(right), v.max(0.0).min(bottom));
     }
-    let places = opacities.iter().zip(us.iter().zip(vs.iter()));
-    for (((place, r), g), b) in places.zip(reds.iter_mut()).zip(greens.iter_mut()).zip(blues.iter_mut()) {
-        let (opacity, (&u, &v)) = place;
-        // Outside the border the nearest pixel suffices.
-        [*r, *g, *b] =
-            if *opacity != T::default() { I::sample(simd, photo, u, v) } else { Nearest::sample(simd, photo, u, v) };
+    let mut start = 0;
+    while start < n {
+        if let (Some(u), Some(v)) = (us[start..].first_chunk(), vs[start..].first_chunk())
+            && let Some([r, g, b]) = I::lanes(simd, photo, u, v)
+        {
+            let end = start + SAMPLE_LANES;
+            reds[start..end].copy_from_slice(&r);
+            greens[start..end].copy_from_slice(&g);
+            blues[start..end].copy_from_slice(&b);
+            start = end;
+            continue;
+        }
+        let end = n.min(start + SAMPLE_LANES);
+        for i in start..end {
+            // Outside the border the nearest pixel suffices.
+            [reds[i], greens[i], blues[i]] =
+                if opacities[i] != 0.0 { I::sample(photo, us[i], vs[i]) } else { Nearest::sample(photo, us[i], vs[i]) };
+        }
+        start = end;
     }
     if let Some(correction) = &correction {
         for ((lift, &u), &v) in lifts.iter_mut().zip(us.iter()).zip(vs.iter()) {
@@ -291,8 +310,8 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
             for ((((opacity, r), g), b), lift) in
                 opacities.iter_mut().zip(reds.iter_mut()).zip(greens.iter_mut()).zip(blues.iter_mut()).zip(lifts.iter())
             {
-                if *opacity != T::default() && r.max(*g).max(*b) >= correction.clipped {
-                    *opacity = T::from_f32(CLIPPED);
+                if *opacity != 0.0 && r.max(*g).max(*b) >= correction.clipped {
+                    *opacity = CLIPPED;
                 }
                 let lift = lift.exp2();
                 // The bicubic kernel overshoots at edges.
@@ -310,7 +329,7 @@ fn sample_row<S: Simd, T: Channel, I: Sampler>(
     }
     let colors = reds.iter().zip(greens.iter()).zip(blues.iter());
     for ((pixel, ((&r, &g), &b)), &opacity) in row.as_chunks_mut::<4>().0.iter_mut().zip(colors).zip(opacities.iter()) {
-        *pixel = [T::from_f32(r), T::from_f32(g), T::from_f32(b), opacity];
+        *pixel = [r, g, b, opacity].map(T::from_f32);
     }
 }
 
@@ -331,14 +350,25 @@ fn split(u: f32, v: f32) -> (usize, usize, f32, f32) {
 
 /// An interpolation kernel. (A type instead of a function pointer, so that it is inlined and compiled for each instruction set.)
 trait Sampler {
-    fn sample<S: Simd, T: Channel>(simd: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3];
+    fn sample<T: Channel>(photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3];
+
+    /// Samples eight positions at once, with the same result; `None` where that is not possible.
+    #[inline(always)]
+    fn lanes<S: Simd, T: Channel>(
+        _: S,
+        _: ImageView<'_, T, 3>,
+        _us: Positions<'_>,
+        _vs: Positions<'_>,
+    ) -> Option<Colors> {
+        None
+    }
 }
 
 struct Nearest;
 
 impl Sampler for Nearest {
     #[inline(always)]
-    fn sample<S: Simd, T: Channel>(_: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
+    fn sample<T: Channel>(photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
         photo.at((u + 0.5) as usize, (v + 0.5) as usize).map(T::to_f32)
     }
 }
@@ -347,7 +377,7 @@ struct Bilinear;
 
 impl Sampler for Bilinear {
     #[inline(always)]
-    fn sample<S: Simd, T: Channel>(_: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
+    fn sample<T: Channel>(photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
         let (x, y, fx, fy) = split(u, v);
         bilinear_at(photo, x, y, fx, fy)
     }
@@ -357,9 +387,19 @@ struct Bicubic;
 
 impl Sampler for Bicubic {
     #[inline(always)]
-    fn sample<S: Simd, T: Channel>(simd: S, photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
+    fn sample<T: Channel>(photo: ImageView<'_, T, 3>, u: f32, v: f32) -> [f32; 3] {
         let (x, y, fx, fy) = split(u, v);
-        T::bicubic(simd, photo, x, y, fx, fy)
+        bicubic_at(photo, x, y, fx, fy)
+    }
+
+    #[inline(always)]
+    fn lanes<S: Simd, T: Channel>(
+        simd: S,
+        photo: ImageView<'_, T, 3>,
+        us: Positions<'_>,
+        vs: Positions<'_>,
+    ) -> Option<Colors> {
+        T::bicubic_lanes(simd, photo, us, vs)
     }
 }
 
