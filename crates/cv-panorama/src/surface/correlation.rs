@@ -1,13 +1,13 @@
 //! Normalized cross-correlation of a small square patch over a search window.
 
-use fearless_simd::{Level, dispatch};
+use fearless_simd::{Level, dispatch, f32x16, prelude::*};
 
-/// Search radius, in pixels of the patch.
-pub(crate) const SEARCH_RADIUS: usize = 8;
+/// Search radius, in pixels of the patch: all displacements along a row but one fill two vectors of AVX2.
+pub(crate) const SEARCH_RADIUS: usize = 7;
 /// Number of displacements along each axis.
 pub(crate) const SEARCH_SIDE: usize = 2 * SEARCH_RADIUS + 1;
 /// Displacements along a row that are computed in parallel: fills whole vectors of every instruction set.
-const LANES: usize = 24;
+const LANES: usize = 16;
 /// Padding after the last sample of a window, read by the lanes beyond [`SEARCH_SIDE`] and ignored.
 pub(crate) const PAD: usize = LANES - SEARCH_SIDE;
 
@@ -47,55 +47,54 @@ impl Template {
     /// Computes the correlations with all positions of a window of side `side + 2 SEARCH_RADIUS`, followed by [`PAD`] samples, row-major; equal to
     /// [`Self::score`] of each.
     pub(crate) fn scores(&self, window: &[f32]) -> [f32; SEARCH_SIDE * SEARCH_SIDE] {
-        dispatch!(Level::new(), _simd => self.scores_inner(window))
+        dispatch!(Level::new(), simd => self.scores_inner(simd, window))
     }
 
     #[inline(always)]
-    fn scores_inner(&self, window: &[f32]) -> [f32; SEARCH_SIDE * SEARCH_SIDE] {
+    fn scores_inner<S: Simd>(&self, simd: S, window: &[f32]) -> [f32; SEARCH_SIDE * SEARCH_SIDE] {
         let wide = self.side + 2 * SEARCH_RADIUS;
         assert_eq!(window.len(), wide * wide + PAD);
         let row = |r: usize| &window[r * wide..][..self.side - 1 + LANES];
-        // Sums along each row of the window, which all vertical shifts share. (Arrays of their own, which stay in registers.)
+        let zero = f32x16::splat(simd, 0.0);
+        // Sums along each row of the window, which all vertical shifts share.
         let mut along = Vec::with_capacity(wide);
         for r in 0..wide {
-            let (mut sum, mut squares) = ([0.0_f32; LANES], [0.0_f32; LANES]);
+            let (mut sum, mut squares) = (zero, zero);
             for theirs in row(r).windows(LANES) {
-                for k in 0..LANES {
-                    sum[k] += theirs[k];
-                    squares[k] += theirs[k] * theirs[k];
-                }
+                let theirs = f32x16::from_slice(simd, theirs);
+                sum += theirs;
+                squares += theirs * theirs;
             }
             along.push((sum, squares));
         }
         let mut scores = [0.0; SEARCH_SIDE * SEARCH_SIDE];
-        // Three shifts at a time, whose sums are independent; the last three may overlap those before.
+        // Three shifts at a time, whose sums are independent.
+        const { assert!(SEARCH_SIDE.is_multiple_of(3)) };
         for start in (0..SEARCH_SIDE).step_by(3) {
-            let start = start.min(SEARCH_SIDE - 3);
-            let mut products = [[0.0_f32; LANES]; 3];
+            let (mut first, mut second, mut third) = (zero, zero, zero);
             for (r, ours) in self.centered.chunks_exact(self.side).enumerate() {
-                let [first, second, third] = [0, 1, 2].map(|dy| row(r + start + dy).windows(LANES));
-                for (a, theirs) in ours.iter().zip(first.zip(second).zip(third)) {
-                    let ((first, second), third) = theirs;
-                    for k in 0..LANES {
-                        products[0][k] += a * first[k];
-                        products[1][k] += a * second[k];
-                        products[2][k] += a * third[k];
-                    }
+                let rows = row(r + start).windows(LANES).zip(row(r + start + 1).windows(LANES));
+                for (a, ((x, y), z)) in ours.iter().zip(rows.zip(row(r + start + 2).windows(LANES))) {
+                    let a = f32x16::splat(simd, *a);
+                    first += a * f32x16::from_slice(simd, x);
+                    second += a * f32x16::from_slice(simd, y);
+                    third += a * f32x16::from_slice(simd, z);
                 }
             }
-            for ((dy, product), out) in
-                (start..).zip(products).zip(scores[start * SEARCH_SIDE..].chunks_exact_mut(SEARCH_SIDE))
-            {
-                let (mut sum, mut squares) = ([0.0_f32; LANES], [0.0_f32; LANES]);
+            for (dy, product) in (start..).zip([first, second, third]) {
+                let (mut sum, mut squares) = (zero, zero);
                 for (row_sum, row_squares) in &along[dy..dy + self.side] {
-                    for k in 0..LANES {
-                        sum[k] += row_sum[k];
-                        squares[k] += row_squares[k];
-                    }
+                    sum += *row_sum;
+                    squares += *row_squares;
                 }
-                for (k, out) in out.iter_mut().enumerate() {
-                    *out = self.normalized(sum[k], squares[k], product[k]);
+                let (mut lanes, [mut sums, mut all_squares]) = ([0.0; LANES], [[0.0; LANES]; 2]);
+                product.store_slice(&mut lanes);
+                sum.store_slice(&mut sums);
+                squares.store_slice(&mut all_squares);
+                for k in 0..LANES {
+                    lanes[k] = self.normalized(sums[k], all_squares[k], lanes[k]);
                 }
+                scores[dy * SEARCH_SIDE..][..SEARCH_SIDE].copy_from_slice(&lanes[..SEARCH_SIDE]);
             }
         }
         scores
@@ -163,7 +162,7 @@ mod tests {
             .map(|v| v as f32)
             .collect();
         window.resize(wide * wide + PAD, 0.0);
-        let (x, y) = (11, 3);
+        let (x, y) = (10, 3);
         // Brighter and of less contrast: the correlation does not mind.
         let patch: Vec<f32> =
             (0..side * side).map(|i| 0.5 * window[(y + i / side) * wide + x + i % side] + 40.0).collect();
