@@ -18,9 +18,12 @@ pub(super) struct Labeling<'a, U, D, F> {
     pub(super) unary: U,
     /// Difference of two labels at a pixel, `difference(a, b, x, y)`. The smoothness term is `LENGTH_COST` plus the differences at both neighbors.
     pub(super) difference: D,
-    /// Returns whether a pixel may change its label.
+    /// Returns which pixels of a row may change their labels.
     pub(super) free: F,
 }
+
+/// Pixels of a row that are skipped at once where none may change its label.
+const RUN: usize = 32;
 
 /// Nodes processed between two checks for cancellation.
 const NODES_PER_CHECK: usize = 1 << 14;
@@ -28,11 +31,11 @@ const NODES_PER_CHECK: usize = 1 << 14;
 /// Infinite capacity.
 const INFINITE: i32 = 1 << 28;
 
-impl<U, D, F> Labeling<'_, U, D, F>
+impl<'a, U, D, F> Labeling<'a, U, D, F>
 where
     U: Fn(usize, usize, usize) -> i32 + Sync,
     D: Fn(usize, usize, usize, usize) -> i32 + Sync,
-    F: Fn(usize, usize) -> bool + Sync,
+    F: Fn(usize) -> &'a [bool] + Sync,
 {
     /// Expands every label in turn until the energy no longer decreases, at most `rounds` times.
     pub(super) fn expand(&self, labels: &mut Image<u16, 1>, rounds: usize, stage: &Stage<'_>) -> Result<(), Cancelled> {
@@ -82,10 +85,16 @@ where
             if is_check_due(y, b.width()) {
                 stage.check()?;
             }
-            for x in b.left..b.right {
-                let label = label_at(x, y);
-                if (self.free)(x, y) && label != NO_PHOTO && usize::from(label) != alpha && own.reaches(x, y) {
-                    places.push([x as u32, y as u32]);
+            let free = &(self.free)(y)[b.left..b.right];
+            for (start, free) in (b.left..).step_by(RUN).zip(free.chunks(RUN)) {
+                if !free.iter().fold(false, |any, free| any | free) {
+                    continue;
+                }
+                for (x, free) in (start..).zip(free) {
+                    let label = label_at(x, y);
+                    if *free && label != NO_PHOTO && usize::from(label) != alpha && own.reaches(x, y) {
+                        places.push([x as u32, y as u32]);
+                    }
                 }
             }
         }
@@ -244,7 +253,7 @@ mod tests {
                 photos: &photos,
                 unary: |l, x, y| self.unary(l, x, y),
                 difference: |a, b, x, y| self.difference(a, b, x, y),
-                free: |x: usize, y: usize| self.free[3 * y + x],
+                free: |y: usize| &self.free[3 * y..3 * y + 3],
             };
             labeling.expand(&mut found, rounds, &stage()).unwrap();
             found.into_vec()

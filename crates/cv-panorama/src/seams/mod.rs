@@ -101,11 +101,11 @@ pub(crate) fn on_preview(
     let mut coarse: Option<Image<u16, 1>> = None;
     for (level, side) in levels {
         let (mut labels, near) = match &coarse {
-            None => (voronoi(level), None),
+            None => (voronoi(level), vec![true; level.width * level.height]),
             Some(coarse) => {
                 let labels = upsampled(coarse, level);
                 let near = seam_band(&labels, BAND_RADIUS, &stage)?;
-                (labels, Some(near))
+                (labels, near)
             }
         };
         // The maximum over 2 × 2 preview pixels: their mean would hide a thin object that the seam cuts. Of larger pixels the mean of these: their maximum is
@@ -136,7 +136,7 @@ pub(crate) fn on_preview(
             (side as f32 * (data_term(&level.pieces[label], clipped, x, y) + transient)) as i32
         };
         let reach: Vec<_> = level.pieces.iter().map(|p| Some(&p.warped)).collect();
-        let free = |x: usize, y: usize| near.as_ref().is_none_or(|near| near[y * level.width + x]);
+        let free = |y: usize| &near[y * level.width..(y + 1) * level.width];
         // Further rounds hardly lower the energy.
         let rounds = if coarse.is_none() { 2 } else { 1 };
         Labeling { photos: &reach, unary, difference: differ, free }.expand(&mut labels, rounds, &stage)?;
@@ -208,7 +208,7 @@ pub(crate) fn refine(
     stage.add(1)?;
     let width = labels.width();
     let differ = |a: usize, c: usize, x: usize, y: usize| difference(pieces[a], pieces[c], x, y);
-    let free = |x: usize, y: usize| near[y * width + x];
+    let free = |y: usize| &near[y * width..(y + 1) * width];
     Labeling { photos: &pieces, unary: |_, _, _| 0, difference: differ, free }.expand(labels, 1, &stage)?;
     stage.add(1)
 }
@@ -234,7 +234,7 @@ fn refine_blocks(
     let reached: Vec<Option<&WarpedPhoto>> = subsampled.iter().map(Option::as_ref).collect();
     let near = seam_band(&before, reach, stage)?;
     let differ = |a: usize, c: usize, x: usize, y: usize| block_difference(photos, a, c, x, y);
-    let free = |x: usize, y: usize| near[y * across + x];
+    let free = |y: usize| &near[y * across..(y + 1) * across];
     let mut after = before.clone();
     Labeling { photos: &reached, unary: |_, _, _| 0, difference: differ, free }.expand(&mut after, 1, stage)?;
     for (i, (old, new)) in before.pixels().zip(after.pixels()).enumerate() {

@@ -58,7 +58,7 @@ pub(crate) fn refine_in_windows<T: Internals>(
                     photos: &pieces,
                     unary: |_, _, _| 0,
                     difference: |a: usize, c: usize, x: usize, y: usize| difference(pieces[a], pieces[c], x, y),
-                    free: |x: usize, y: usize| free[y * names.width() + x],
+                    free: |y: usize| &free[y * names.width()..(y + 1) * names.width()],
                 };
                 let changed = labeling.expand_one(&names, alpha, &stage)?;
                 stage.add(1)?;
@@ -176,7 +176,7 @@ fn refine_blocks<T: Internals>(
                     photos: &reached,
                     unary: |_, _, _| 0,
                     difference: |a: usize, c: usize, x: usize, y: usize| super::block_difference(&pieces, a, c, x, y),
-                    free: |x: usize, y: usize| near[(blocks.top + y) * across + blocks.left + x],
+                    free: |y: usize| &near[(blocks.top + y) * across..(blocks.top + y + 1) * across][blocks.left..],
                 };
                 let changed = labeling.expand_one(&names, alpha, stage)?;
                 let global = |i: usize| (blocks.top + i / blocks.width()) * across + blocks.left + i % blocks.width();
