@@ -5,7 +5,8 @@ use crate::photometric::{Adaptation, ExposureCorrection, Gains, SATURATED_LEVEL}
 use crate::rows::is_check_due;
 use crate::surface::{Bounds, DisplacementField, Layout, Map, Placement, Surface, WarpSettings, WarpedPhoto, warp};
 use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Scaling, Stage, luma_f32};
-use cv_imgproc::Interpolation;
+use cv_imgproc::{Interpolation, Pixel};
+use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 
 /// All placements warped at `1 / step` of the canvas resolution.
@@ -33,7 +34,37 @@ pub(crate) struct Piece {
     pub(crate) cost: Vec<f32>,
 }
 
+/// Pixels that are corrected at once.
+const BLOCK: usize = 64;
+
 impl Piece {
+    #[inline(always)]
+    fn correct(&mut self, correction: &ExposureCorrection<'_>, adaptation: Option<&Adaptation>) {
+        let b = self.warped.bounds;
+        let blocks = self.warped.pixels.as_mut_slice().as_chunks_mut::<4>().0.chunks_mut(BLOCK);
+        let ([mut reds, mut greens, mut blues], mut lifts, mut clipped) =
+            ([[0.0; BLOCK]; 3], [0.0; BLOCK], [0.0; BLOCK]);
+        for ((start, pixels), radius) in (0..).step_by(BLOCK).zip(blocks).zip(self.radius.chunks(BLOCK)) {
+            let n = pixels.len();
+            for (k, (p, r2)) in pixels.iter().zip(radius).enumerate() {
+                let levels = [p[0], p[1], p[2]].map(f32::from);
+                let mut lift = correction.vignetting_stops(*r2);
+                if let Some(adaptation) = adaptation {
+                    let (x, y) = (b.left + (start + k) % b.width(), b.top + (start + k) / b.width());
+                    lift += adaptation.at_preview(x, y, correction.log_luminance(luma_f32(levels)) + lift);
+                }
+                [reds[k], greens[k], blues[k]] = levels;
+                lifts[k] = lift;
+            }
+            let colors = [&mut reds[..n], &mut greens[..n], &mut blues[..n]];
+            correction.row_of_levels::<false>(colors, &lifts[..n], &mut clipped);
+            for (k, p) in pixels.iter_mut().enumerate() {
+                let [r, g, b] = [reds[k], greens[k], blues[k]].map(u8::from_f32);
+                *p = [r, g, b, p[3]];
+            }
+        }
+    }
+
     /// Averages blocks of 2 × 2 pixels that lie completely within the bounds; covered where all four are.
     fn halved(&self) -> Self {
         let (b, pixels) = (self.warped.bounds, &self.warped.pixels);
@@ -163,18 +194,7 @@ impl Preview {
         let tone = gains.adapted_tone(adaptation, 1);
         self.pieces.par_iter_mut().zip(photo_of).for_each(|(piece, &photo)| {
             let correction = ExposureCorrection::new(&tone, gains, photo);
-            let b = piece.warped.bounds;
-            let pixels = piece.warped.pixels.as_mut_slice().as_chunks_mut::<4>().0;
-            for (i, (p, r2)) in pixels.iter_mut().zip(&piece.radius).enumerate() {
-                let (levels, mut lift) = ([p[0], p[1], p[2]].map(f32::from), correction.vignetting_stops(*r2));
-                if let Some(adaptation) = adaptation {
-                    let guide = correction.log_luminance(luma_f32(levels)) + lift;
-                    lift += adaptation.at_preview(b.left + i % b.width(), b.top + i / b.width(), guide);
-                }
-                let color = correction.levels(levels, lift);
-                let [r, g, b] = color.map(|v| (v + 0.5) as u8);
-                *p = [r, g, b, p[3]];
-            }
+            dispatch!(Level::new(), _simd => piece.correct(&correction, adaptation));
         });
     }
 
@@ -202,24 +222,27 @@ pub(crate) fn downsample_box(photo: ImageView<'_, u8, 3>, step: usize, stage: &S
     let (bw, bh) = (step.min(photo.width()), step.min(photo.height()));
     let mut small = RgbU8::new(width, height, [0; 3]);
     let area = (bw * bh) as u32;
-    let mut sums = vec![0_u32; 3 * width];
+    let mut columns = vec![0_u32; 3 * bw * width];
     for y in 0..height {
         if is_check_due(y, 3 * photo.width() * bh) {
             stage.check()?;
         }
-        sums.fill(0);
-        for row in y * bh..(y + 1) * bh {
-            let row = photo.row(row);
-            for (sum, block) in sums.as_chunks_mut::<3>().0.iter_mut().zip(row.chunks_exact(3 * bw)) {
-                for p in block.as_chunks::<3>().0 {
-                    for c in 0..3 {
-                        sum[c] += u32::from(p[c]);
-                    }
+        // Down the columns first, which is vectorized.
+        columns.fill(0);
+        dispatch!(Level::new(), _simd => for row in y * bh..(y + 1) * bh {
+            for (sum, v) in columns.iter_mut().zip(photo.row(row)) {
+                *sum += u32::from(*v);
+            }
+        });
+        let blocks = columns.chunks_exact(3 * bw);
+        for (out, block) in small.row_mut(y).as_chunks_mut::<3>().0.iter_mut().zip(blocks) {
+            let mut sum = [area / 2; 3];
+            for p in block.as_chunks::<3>().0 {
+                for c in 0..3 {
+                    sum[c] += p[c];
                 }
             }
-        }
-        for (out, sum) in small.row_mut(y).iter_mut().zip(&sums) {
-            *out = ((sum + area / 2) / area) as u8;
+            *out = sum.map(|sum| (sum / area) as u8);
         }
     }
     Ok(small)
