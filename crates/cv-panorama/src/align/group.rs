@@ -27,6 +27,9 @@ pub(crate) struct Group<'a> {
 /// Maximum number of matches per overlap in the initial adjustment: thirty times the three unknowns of a rotation.
 const MAX_INITIAL_MATCHES: usize = 100;
 
+/// Maximum number of matches per overlap in model selection.
+const MAX_SELECTION_MATCHES: usize = 300;
+
 /// Minimum spread of log focal lengths at which photographs get separate focal lengths (zoom); refocusing changes them by less.
 const MIN_ZOOM_LOG_SPREAD: f64 = 0.03;
 
@@ -167,10 +170,10 @@ impl<'a> Group<'a> {
         }
     }
 
-    /// Subsamples the matches of each overlap uniformly for the initial adjustment.
-    fn subsampled_overlaps(&self) -> Vec<Overlap> {
+    /// Subsamples the matches of each overlap uniformly, to at most `most`.
+    fn subsampled_overlaps(&self, most: usize) -> Vec<Overlap> {
         let subsample = |o: &Overlap| {
-            let step = o.points.len().div_ceil(MAX_INITIAL_MATCHES).max(1);
+            let step = o.points.len().div_ceil(most).max(1);
             Overlap { points: o.points.iter().copied().step_by(step).collect(), ..*o }
         };
         self.overlaps.iter().map(subsample).collect()
@@ -211,7 +214,7 @@ impl<'a> Group<'a> {
         let prior = self.focal_guesses(&representatives);
         let known = representatives.iter().all(|&h| self.photos[h].camera.is_some() || self.photos[h].focal.is_some());
         let factors: &[f64] = if known { &[1.0] } else { &[1.0, 0.6, 1.7, 3.0] };
-        let few = self.subsampled_overlaps();
+        let few = self.subsampled_overlaps(MAX_INITIAL_MATCHES);
         let wide =
             Problem { overlaps: &few, ..self.problem(Motion::Rotation, &lens_of, &prior, 10.0 * options.outlier_px) };
         let start = |factor: &f64| {
@@ -232,7 +235,9 @@ impl<'a> Group<'a> {
             return Ok(Solution { lens_of, prior, state: State { motion: Vec::new(), lenses: Vec::new() } });
         };
         stage.check()?;
-        let mut problem = self.problem(Motion::Rotation, &lens_of, &prior, options.outlier_px);
+        let some = self.subsampled_overlaps(MAX_SELECTION_MATCHES);
+        let mut problem =
+            Problem { overlaps: &some, ..self.problem(Motion::Rotation, &lens_of, &prior, options.outlier_px) };
         let (mut state, mut cost) = problem.solve(state, Limits::SELECTION);
         // Model selection: an unknown must reduce the cost by 5 %; parallax alone gives less.
         let is_significant = |new: f64, old: f64| new < 0.95 * old - 20.0 * options.outlier_px.powi(2);
@@ -258,11 +263,11 @@ impl<'a> Group<'a> {
             let focals = with.lenses.iter().map(|l| l.log_focal);
             let spread = focals.clone().fold(f64::MIN, f64::max) - focals.fold(f64::MAX, f64::min);
             if is_significant(new, cost) && new < 0.8 * cost && spread > MIN_ZOOM_LOG_SPREAD {
-                let (state, _) = apart.solve(with, Limits::RESULT);
+                let (state, _) = Problem { overlaps: &self.overlaps, ..apart }.solve(with, Limits::RESULT);
                 return Ok(Solution { lens_of: own, prior: own_prior, state });
             }
         }
-        let (state, _) = problem.solve(state, Limits::RESULT);
+        let (state, _) = Problem { overlaps: &self.overlaps, ..problem }.solve(state, Limits::RESULT);
         Ok(Solution { lens_of, prior, state })
     }
 
@@ -275,7 +280,7 @@ impl<'a> Group<'a> {
             .map(|&h| Lens { log_focal: self.photos[h].expected_focal().ln(), k1: 0.0 })
             .collect();
         let motion = self.compose(Motion::Homography, &lens_of, &lenses);
-        let few = self.subsampled_overlaps();
+        let few = self.subsampled_overlaps(MAX_INITIAL_MATCHES);
         let wide =
             Problem { overlaps: &few, ..self.problem(Motion::Homography, &lens_of, &prior, 10.0 * options.outlier_px) };
         let (state, _) = wide.solve(State { motion, lenses }, Limits::START);

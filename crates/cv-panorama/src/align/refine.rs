@@ -26,6 +26,8 @@ const PADDED: usize = SIDE.next_multiple_of(LANES);
 const STRIDE: usize = PADDED + 2;
 /// Maximum number of patches per pair, and per photograph if it has several pairs.
 const MAX_PATCHES: usize = 300;
+/// Maximum number of patches in the second pass, side by side: errors of the focal length are inversely proportional to its square root.
+const MAX_DENSE_PATCHES: usize = 1200;
 /// Scale of the loss relative to that of features, without parallax.
 const NARROW_LOSS_RATIO: f64 = 0.25;
 /// Scale of the loss relative to the median residual of the refined matches, without parallax: their errors are 0.06 px but for one in ten, which has up to a pixel.
@@ -66,42 +68,41 @@ pub fn refine_alignment(
     progress: &dyn Progress,
 ) -> Result<Alignment, Cancelled> {
     let stage = Stage::new(progress, "align", 0)?;
-    let level = Level::new();
-    let used = alignment.used().count();
-    let count = (MAX_PATCHES * used / alignment.pairs.len().max(1)).min(MAX_PATCHES);
-    let view = |i: usize| alignment.views.get(i).and_then(|v| v.as_ref().ok());
     let aligned: HashSet<(usize, usize)> = alignment.pairs.iter().map(|p| (p.a, p.b)).collect();
-    let refine = |pair: &VerifiedPair| -> Result<Option<VerifiedPair>, Cancelled> {
-        stage.check()?;
-        let is_used = aligned.contains(&(pair.a, pair.b));
-        let (Some(from), Some(to), true) = (view(pair.a), view(pair.b), is_used) else { return Ok(None) };
-        let (Some(first), Some(second)) = (images.get(pair.a), images.get(pair.b)) else { return Ok(None) };
-        let candidates = candidates(pair, from, to, count);
-        let refined = candidates.iter().filter_map(|m| refine_match(level, [first, second], from, to, m));
-        let matches: Vec<Correspondence> = refined.collect();
-        if matches.len() < MIN_MATCHES {
-            return Ok(Some(pair.clone()));
-        }
-        Ok(Some(VerifiedPair { inliers: (0..matches.len()).collect(), matches, ..pair.clone() }))
-    };
-    let refined: Vec<Option<VerifiedPair>> = pairs.par_iter().map(refine).collect::<Result<_, _>>()?;
-    let refined: Vec<VerifiedPair> = refined.into_iter().flatten().collect();
+    let pairs: Vec<&VerifiedPair> = pairs.iter().filter(|pair| aligned.contains(&(pair.a, pair.b))).collect();
+    let refined: Vec<VerifiedPair> = pairs
+        .par_iter()
+        .map(|pair| {
+            let matches = register_pair(images, &alignment, pair, MAX_PATCHES, &stage)?;
+            let are_enough = matches.len() >= MIN_MATCHES;
+            Ok(if are_enough { with_matches(pair, matches) } else { (*pair).clone() })
+        })
+        .collect::<Result<_, Cancelled>>()?;
     // Without parallax, residuals are those of the registration, and a narrow loss rejects what moved.
     let has_parallax = alignment.median_px > MAX_MEDIAN_RATIO * options.outlier_px;
     let outlier_px = options.outlier_px * if has_parallax { 1.0 } else { NARROW_LOSS_RATIO };
     let options = AlignOptions { motion: alignment.motion, outlier_px, ..*options };
-    let solve = |start: &Alignment, options: &AlignOptions| {
+    let solve = |start: &Alignment, pairs: &[VerifiedPair], options: &AlignOptions| {
         // The focal lengths found are where the search for better ones starts.
         let focal = |i: usize| start.views.get(i).and_then(|v| v.as_ref().ok()).map(|v| v.camera.fx);
         let photos: Vec<Photo> =
             photos.iter().enumerate().map(|(i, p)| Photo { focal: focal(i).or(p.focal), ..*p }).collect();
-        align(&photos, &refined, options, progress)
+        align(&photos, pairs, options, progress)
     };
-    let found = match solve(&alignment, &options) {
-        // The median residual is known now: registrations beyond a few times as far off are false.
+    let found = match solve(&alignment, &refined, &options) {
+        // Now patches converge at once, and the median residual is known: registrations beyond a few times as far off are false.
         Ok(found) if !has_parallax => {
+            let dense: Vec<VerifiedPair> = refined
+                .par_iter()
+                .map(|pair| {
+                    let matches =
+                        register_pair(images, &found, &with_matches(pair, Vec::new()), MAX_DENSE_PATCHES, &stage)?;
+                    let are_more = matches.len() > pair.matches.len();
+                    Ok(if are_more { with_matches(pair, matches) } else { pair.clone() })
+                })
+                .collect::<Result<_, Cancelled>>()?;
             let scale = (LOSS_PER_MEDIAN * found.median_px).clamp(MIN_LOSS_PX, options.outlier_px);
-            solve(&found, &AlignOptions { outlier_px: scale, ..options })
+            solve(&found, &dense, &AlignOptions { outlier_px: scale, ..options })
         }
         other => other,
     };
@@ -118,6 +119,29 @@ pub fn refine_alignment(
     found.pairs = alignment.pairs;
     found.measure();
     Ok(found)
+}
+
+/// A pair with other matches.
+fn with_matches(pair: &VerifiedPair, matches: Vec<Correspondence>) -> VerifiedPair {
+    VerifiedPair { inliers: (0..matches.len()).collect(), matches, ..pair.clone() }
+}
+
+/// Registers patches of a pair, at most `most`, and per photograph if it has several pairs.
+fn register_pair(
+    images: &[GrayU8],
+    alignment: &Alignment,
+    pair: &VerifiedPair,
+    most: usize,
+    stage: &Stage<'_>,
+) -> Result<Vec<Correspondence>, Cancelled> {
+    stage.check()?;
+    let view = |i: usize| alignment.views.get(i).and_then(|v| v.as_ref().ok());
+    let (Some(from), Some(to)) = (view(pair.a), view(pair.b)) else { return Ok(Vec::new()) };
+    let (Some(first), Some(second)) = (images.get(pair.a), images.get(pair.b)) else { return Ok(Vec::new()) };
+    let count = (most * alignment.used().count() / alignment.pairs.len().max(1)).min(most);
+    let level = Level::new();
+    let candidates = candidates(pair, from, to, count);
+    Ok(candidates.iter().filter_map(|m| refine_match(level, [first, second], from, to, m)).collect())
 }
 
 /// Positions where patches are registered: `count` at most, half of them at features, the others on a grid over the overlap.
