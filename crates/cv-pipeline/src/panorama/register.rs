@@ -219,8 +219,19 @@ const MIN_REDUCTION: f64 = 1.2;
 fn reduced<T: Pixel, const C: usize>(image: ImageView<'_, T, C>, pixels: usize) -> Option<Image<T, C>> {
     let (w, h) = image.size();
     let factor = ((w * h) as f64 / pixels.max(10_000) as f64).sqrt();
-    let size = ((w as f64 / factor).round() as usize, (h as f64 / factor).round() as usize);
-    (factor > MIN_REDUCTION).then(|| cv_imgproc::resize_area(image, size.0, size.1).ok()).flatten()
+    let (width, height) = isotropic_size((w, h), factor);
+    (factor > MIN_REDUCTION).then(|| cv_imgproc::resize_area(image, width, height).ok()).flatten()
+}
+
+/// Returns the size of an image reduced by `factor`, or by up to 3 % more where the factors of both axes then differ less: rounding the sides alone makes them
+/// differ by up to the reciprocal of a side, and the focal length would be wrong by as much.
+fn isotropic_size((width, height): (usize, usize), factor: f64) -> (usize, usize) {
+    let largest = (width as f64 / factor).round() as usize;
+    let size = |w: usize| (w, (w as f64 * height as f64 / width as f64).round() as usize);
+    let anisotropy = |(w, h): (usize, usize)| ((w * height) as f64 / (h * width) as f64 - 1.0).abs();
+    // Of equal ones the largest.
+    let sizes = (largest - largest * 3 / 100..=largest).rev().map(size);
+    sizes.min_by(|a, b| anisotropy(*a).total_cmp(&anisotropy(*b))).unwrap_or(size(largest))
 }
 
 /// A matched pair, and the verified one if it was accepted.
@@ -303,6 +314,23 @@ fn describe(
 mod tests {
     use super::*;
     use cv_core::{Correspondence, Matrix3};
+
+    #[test]
+    fn reduced_images_keep_their_aspect_ratio() {
+        for (size, factor, expected) in
+            [((1600, 1200), 1.549, (1032, 774)), ((4000, 3000), 3.873, (1032, 774)), ((5, 4), 1.3, (4, 3))]
+        {
+            assert_eq!(isotropic_size(size, factor), expected);
+        }
+        for size in [(1601, 1203), (2272, 1704), (1999, 3001), (6016, 4016), (3001, 1001)] {
+            let (w, h) = isotropic_size(size, 2.3);
+            let factors = [size.0 as f64 / w as f64, size.1 as f64 / h as f64];
+            // A tenth of what rounding the sides alone can give; and hardly smaller.
+            assert!((factors[0] / factors[1] - 1.0).abs() < 0.05 / w.min(h) as f64, "{size:?} {w} {h}");
+            assert!((2.29..2.38).contains(&factors[0]), "{size:?} {w} {h}");
+        }
+        assert_eq!(isotropic_size((1, 90_000), 3.0).0, 0);
+    }
 
     #[test]
     fn strong_connectivity_needs_strong_pairs_between_all_photographs() {
