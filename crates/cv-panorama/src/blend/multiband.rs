@@ -16,12 +16,11 @@ use std::ops::RangeInclusive;
 
 type Pixel = [f32; 4];
 
-/// Bands above the coarse levels of [`CoarseLevels`], at most: those take a fiftieth of the memory of the whole pyramid then, and strips overlap by some
-/// hundred rows.
+/// Bands above the coarse levels of [`CoarseLevels`], at most: those take a fiftieth of the memory of the whole pyramid then, and tiles overlap by some
+/// hundred pixels.
 const FINE_BANDS: usize = 3;
 
-/// The coarse levels of the blended canvas. With them it is blended in strips of rows, each with the fine bands of its rows only, to the same values as
-/// whole.
+/// The coarse levels of the blended canvas. With them it is blended in tiles, each with the fine bands of its pixels only, to the same values as whole.
 pub(crate) struct CoarseLevels {
     pyramid: Pyramid,
     /// Bands above the first level.
@@ -33,7 +32,7 @@ fn fine_bands(bands: usize) -> usize {
     FINE_BANDS.min(bands.max(1) - 1)
 }
 
-/// Returns the rows by which a strip must be larger on either side: twice the support of the kernel, and three pixels for upsampling, at the first of the
+/// Returns the pixels by which a tile must be larger on each side: twice the support of the kernel, and three pixels for upsampling, at the first of the
 /// coarse levels.
 pub(crate) fn coarse_margin(bands: usize) -> usize {
     6 << (fine_bands(bands) + 1)
@@ -84,27 +83,27 @@ pub(crate) struct CoarseCanvas {
 }
 
 impl CoarseCanvas {
-    /// Blends a strip that begins at row `top` of the canvas; photographs and labels are those of its rows, in its coordinates. Its first and last row must be
-    /// multiples of 2^bands, or those of the canvas. Rows closer to its ends than [`coarse_margin`] are not valid, except at the ends of the canvas.
+    /// Blends a tile that begins at column `left` and row `top` of the canvas; photographs and labels are those of its pixels, in its coordinates. Its sides
+    /// must lie on multiples of 2^bands, or on those of the canvas. Pixels closer to them than [`coarse_margin`] are not valid, except at the sides of the canvas.
     ///
     /// # Errors
     /// [`Cancelled`].
-    pub(crate) fn strip<T: Channel>(
+    pub(crate) fn tile<T: Channel>(
         &self,
-        top: usize,
+        (left, top): (usize, usize),
         photos: &[Option<WarpedPhoto<T>>],
         labels: &Image<u16, 1>,
         stage: &Stage<'_>,
     ) -> Result<Image<T, 3>, Cancelled> {
-        let Level { width, height, ref data, .. } = self.level;
         let unit = 1 << (self.fine + 1);
-        let rows = top / unit..(top + labels.height()).div_ceil(unit).min(height);
+        let columns = left / unit..(left + labels.width()).div_ceil(unit).min(self.level.width);
+        let rows = top / unit..(top + labels.height()).div_ceil(unit).min(self.level.height);
         let base = Level {
             left: 0,
             top: 0,
-            width,
+            width: columns.len(),
             height: rows.len(),
-            data: data[rows.start * width..rows.end * width].to_vec(),
+            data: rows.flat_map(|y| &self.level.row(y)[columns.clone()]).copied().collect(),
         };
         join(photos, labels, self.fine, Some(base), stage)
     }

@@ -25,7 +25,8 @@ use crate::surface::{
     Bounds, Layout, PhotoMap, Preview, PreviewScale, ROUND_UNITS, WarpedPhoto, displacements_with, downsample_box,
     largest_rectangle_of, layout,
 };
-use budget::{Budget, needs_whole, strip_bytes};
+use blend::Tiling;
+use budget::{Budget, needs_whole};
 use cv_core::{Image, ImageView, Mask, Progress, RgbU8, Stage, StageClock};
 use rayon::prelude::*;
 use scratch::{GrayStore, Scratch};
@@ -215,8 +216,7 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     let levels = options.blend.blender::<T>().pyramid_levels(typical_side).min(16);
     let canvas = (layout.width, layout.height);
     let largest: Vec<Bounds> = layout.placements.iter().map(|p| p.bounds).collect();
-    let fewest_rows = blend::fewest_rows(options.blend, levels);
-    let budget = Budget::new::<T>(&layout, &largest, options, fewest_rows, limit.bytes)?;
+    let budget = Budget::new::<T>(&layout, &largest, options, levels, limit.bytes)?;
     if needs_whole(options).is_some() {
         return draw_whole(photos, &masks, alignment, options, output, progress);
     }
@@ -283,7 +283,7 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     let mut labels = LabelRows::new(canvas.0);
     {
         let stage = Stage::new(progress, "seams", 1)?;
-        let rows = (budget.work / strip_bytes::<T>(canvas.0).max(1)).clamp(1, canvas.1);
+        let rows = (budget.work / (blend::tile_bytes::<T>() * canvas.0).max(1)).clamp(1, canvas.1);
         for top in (0..canvas.1).step_by(rows) {
             let strip = Bounds { left: 0, top, right: canvas.0, bottom: (top + rows).min(canvas.1) };
             let crops = warped.crops(strip)?;
@@ -311,8 +311,8 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     if output.wants_layers() {
         layers(&warped, &labels, shown, &photo_of, output, progress)?;
     }
-    let rows = (budget.work / strip_bytes::<T>(canvas.0).max(1)).max(fewest_rows);
-    let strips = blend::Strips { photos: &warped, labels: &labels, typical_side, levels, mode: options.blend, rows };
+    let tiling = Tiling::within::<T>(budget.work, options.blend, levels, canvas.0);
+    let strips = blend::Strips { photos: &warped, labels: &labels, typical_side, levels, mode: options.blend, tiling };
     strips.blend(shown, &photo_of, output, progress)?;
     clock.lap("blend");
 
