@@ -1,8 +1,8 @@
 //! Compositing of panoramas larger than memory.
 //!
 //! Photographs are loaded one after the other, twice: for the gray images of local alignment and the preview, and for warping. Warped photographs go to a
-//! scratch file, labels are run-length encoded, seams are refined on the window of one photograph at a time, and the canvas is blended in strips of rows that
-//! are handed on. The pixels are the same as those of [`render`](crate::render).
+//! scratch file, labels are run-length encoded, seams are refined on the window of one photograph at a time, and the canvas is blended in strips of rows, and
+//! these in tiles, that are handed on. The pixels are the same as those of [`render`](crate::render).
 
 mod blend;
 mod budget;
