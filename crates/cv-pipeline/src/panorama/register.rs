@@ -219,8 +219,11 @@ const MIN_REDUCTION: f64 = 1.2;
 fn reduced<T: Pixel, const C: usize>(image: ImageView<'_, T, C>, pixels: usize) -> Option<Image<T, C>> {
     let (w, h) = image.size();
     let factor = ((w * h) as f64 / pixels.max(10_000) as f64).sqrt();
+    if factor <= MIN_REDUCTION {
+        return None;
+    }
     let (width, height) = isotropic_size((w, h), factor);
-    (factor > MIN_REDUCTION).then(|| cv_imgproc::resize_area(image, width, height).ok()).flatten()
+    cv_imgproc::resize_area(image, width, height).ok()
 }
 
 /// Returns the size of an image reduced by `factor`, or by up to 3 % more where the factors of both axes then differ less: rounding the sides alone makes them
