@@ -52,7 +52,7 @@ pub trait Channel: Pixel {
 
     fn widened(self) -> Self::Sum;
 
-    /// [`bicubic_rgb_lanes`], where it has the type.
+    /// As [`bicubic_rgb_lanes`] for bytes; `None` for other types, whose positions are interpolated one by one.
     #[inline(always)]
     fn bicubic_lanes<S: Simd>(_: S, _: ImageView<'_, Self, 3>, _: Positions<'_>, _: Positions<'_>) -> Option<Colors> {
         None

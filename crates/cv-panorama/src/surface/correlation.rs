@@ -2,11 +2,11 @@
 
 use fearless_simd::{Level, dispatch, f32x16, prelude::*};
 
-/// Search radius, in pixels of the patch: all displacements along a row but one fill two vectors of AVX2.
+/// Search radius, in pixels of the patch: the largest whose displacements along a row fit in two vectors of AVX2.
 pub(crate) const SEARCH_RADIUS: usize = 7;
 /// Number of displacements along each axis.
 pub(crate) const SEARCH_SIDE: usize = 2 * SEARCH_RADIUS + 1;
-/// Displacements along a row that are computed in parallel: fills whole vectors of every instruction set.
+/// Displacements along a row that are computed in parallel, in whole vectors of every instruction set.
 const LANES: usize = 16;
 /// Padding after the last sample of a window, read by the lanes beyond [`SEARCH_SIDE`] and ignored.
 pub(crate) const PAD: usize = LANES - SEARCH_SIDE;

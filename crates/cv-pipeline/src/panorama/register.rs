@@ -333,6 +333,10 @@ mod tests {
             assert!((2.29..2.38).contains(&factors[0]), "{size:?} {w} {h}");
         }
         assert_eq!(isotropic_size((1, 90_000), 3.0).0, 0);
+        // At full resolution.
+        let image = GrayF32::new(300, 200, [0.0]);
+        assert!(reduced(image.view(), usize::MAX).is_none() && reduced(image.view(), 50_000).is_none());
+        assert_eq!(reduced(image.view(), 10_000).map(|image| image.size()), Some((120, 80)));
     }
 
     #[test]
