@@ -47,6 +47,7 @@ mod rectify;
 mod rig_depth;
 mod segment;
 mod sfm;
+mod similar;
 mod vertical_matches;
 mod vertical_offset;
 

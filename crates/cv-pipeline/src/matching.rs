@@ -65,6 +65,13 @@ impl Default for MatchingOptions {
     }
 }
 
+impl MatchingOptions {
+    /// Returns the settings of the comparison of descriptors.
+    pub(crate) fn descriptor_matching(&self) -> MatchOptions {
+        MatchOptions { ratio: self.ratio, mutual: self.mutual, ..MatchOptions::default() }
+    }
+}
+
 /// Result of [`match_photos`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct MatchingResult {
@@ -164,7 +171,7 @@ pub fn match_features(
     options: &MatchingOptions,
     progress: &dyn Progress,
 ) -> Result<Vec<DMatch>, MatchError> {
-    let settings = MatchOptions { ratio: options.ratio, mutual: options.mutual, ..MatchOptions::default() };
+    let settings = options.descriptor_matching();
     match (ByteDescriptors::new(&a.descriptors), ByteDescriptors::new(&b.descriptors)) {
         (Some(a), Some(b)) => match_byte_descriptors(&a, &b, &settings, progress),
         _ => match_descriptors(&a.descriptors, &b.descriptors, &settings, progress),

@@ -170,7 +170,8 @@ pub struct PanoramaResult<T = u8> {
     pub labels: Image<u16, 1>,
     /// One entry per input.
     pub images: Vec<PanoramaImage>,
-    /// All pairs with matches; empty for [`panorama_with`].
+    /// The matched pairs: of large sets only similar photographs, and without those rejected before a second matching with more features. Empty for
+    /// [`panorama_with`].
     pub pairs: Vec<PanoramaPair>,
     /// Features of each photograph, in its own pixels; empty for [`panorama_with`].
     pub features: Vec<Features>,
@@ -252,8 +253,8 @@ impl From<RenderError> for PanoramaError {
 
 /// Stitches overlapping photographs, in any order, to a panorama.
 ///
-/// Extracts features on resized photographs, matches and verifies all pairs (repeated with more features where the connections are weak), aligns by bundle adjustment, and composites at
-/// full size. Photographs without a consistent pair are left out with the reason. The panorama has the sample type of the photographs, `u8` or `u16`; alignment uses 8 bits.
+/// Extracts features on resized photographs, matches and verifies all pairs (in sets of more than 41 photographs the 20 most similar ones of each, and those between photographs that are
+/// not connected; repeated with more features where the connections are weak), aligns by bundle adjustment, and composites at full size. Photographs without a consistent pair are left out with the reason. The panorama has the sample type of the photographs, `u8` or `u16`; alignment uses 8 bits.
 ///
 /// # Errors
 /// [`PanoramaError`]: fewer than two photographs belong together, or the canvas would be too large.

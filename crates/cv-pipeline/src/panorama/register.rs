@@ -6,8 +6,11 @@ use crate::panorama::masked::{clip_removed, drop_removed};
 use crate::panorama::{
     LeftOut, NearestPair, PanoramaError, PanoramaImage, PanoramaOptions, PanoramaPair, PanoramaPhoto,
 };
+use crate::similar::similar_pairs;
 use cv_core::{Camera, Cancelled, GrayF32, GrayU8, Image, ImageView, RgbU8, Scaling, Stage, StageClock, UnionFind};
-use cv_features::{FeatureError, FeatureOptions, Features, MatchError, SiftOptions};
+use cv_features::{
+    ByteDescriptors, FeatureError, FeatureOptions, Features, MatchError, SiftOptions, match_byte_descriptors,
+};
 use cv_imgproc::Pixel;
 use cv_panorama::{
     AlignError, Alignment, PairRejection, Photo, PhotoMask, Unplaced, VerifiedPair, align, refine_alignment,
@@ -33,7 +36,6 @@ pub(super) fn register(
     let mut clock = StageClock::new();
     let n = photos.count();
     let indices: Vec<usize> = (0..n).collect();
-    let candidates: Vec<(usize, usize)> = (0..n).flat_map(|a| (a + 1..n).map(move |b| (a, b))).collect();
     let mut prepared: Vec<Prepared> = Vec::with_capacity(n);
     {
         let stage = Stage::new(progress, "features", n)?;
@@ -43,26 +45,13 @@ pub(super) fn register(
             prepared.extend(batch.collect::<Result<Vec<_>, _>>()?);
         }
     }
-    let mut extract_and_match = |prepared: &mut [Prepared],
-                                 matching: &MatchingOptions,
-                                 pixels: usize|
-     -> Result<Vec<Option<MatchedPair>>, Cancelled> {
+    let extract = |prepared: &mut [Prepared], matching: &MatchingOptions, pixels: usize| -> Result<(), Cancelled> {
         let stage = Stage::new(progress, "features", n)?;
         prepared.par_iter_mut().try_for_each(|p| {
             p.extract(matching, pixels, &stage)?;
             stage.add(1)
         })?;
-        clock.lap("features");
-        let prepared = &*prepared;
-        let stage = Stage::new(progress, "match", candidates.len())?;
-        let compare = |&(a, b): &(usize, usize)| -> Result<Option<MatchedPair>, Cancelled> {
-            let pair = try_pair(prepared, a, b, options, &stage)?;
-            stage.add(1)?;
-            Ok(pair)
-        };
-        let matched = candidates.par_iter().map(compare).collect::<Result<_, Cancelled>>()?;
-        clock.lap("match");
-        Ok(matched)
+        Ok(())
     };
     let matching = &options.matching;
     // SIFT at twice the resolution takes most of the time, and low-contrast features are less accurate: both are used only where needed. Matches are refined at the resolution of the
@@ -74,14 +63,29 @@ pub(super) fn register(
         }
         _ => None,
     };
-    let mut matched = match &plain {
-        Some(plain) => extract_and_match(&mut prepared, plain, options.registration_pixels / 2)?,
-        None => extract_and_match(&mut prepared, matching, usize::MAX)?,
-    };
-    if plain.is_some() && !is_strongly_connected(n, &matched) {
-        matched = extract_and_match(&mut prepared, matching, usize::MAX)?;
+    match &plain {
+        Some(plain) => extract(&mut prepared, plain, options.registration_pixels / 2)?,
+        None => extract(&mut prepared, matching, usize::MAX)?,
     }
-    let (pairs, verified): (Vec<PanoramaPair>, Vec<Option<VerifiedPair>>) = matched.into_iter().flatten().unzip();
+    clock.lap("features");
+    let candidates = candidate_pairs(&prepared, progress)?;
+    let mut matched = match_pairs(&prepared, &candidates, options, progress)?;
+    clock.lap("match");
+    let mut remaining = unconnected_pairs(n, &matched, &candidates);
+    let strong = Components::new(n, &matched, MIN_STRONG_INLIERS);
+    if plain.is_some() && strong.count() > 1 {
+        extract(&mut prepared, matching, usize::MAX)?;
+        clock.lap("features");
+        // Of the pairs between strongly connected photographs only the verified ones.
+        let is_repeated = |(pair, verified): &MatchedPair| verified.is_some() || !strong.joins(pair.a, pair.b);
+        remaining.extend(matched.drain(..).filter(is_repeated).map(|(pair, _)| (pair.a, pair.b)));
+    }
+    if !remaining.is_empty() {
+        matched.extend(match_pairs(&prepared, &remaining, options, progress)?);
+        matched.sort_by_key(|(pair, _)| (pair.a, pair.b));
+        clock.lap("match");
+    }
+    let (pairs, verified): (Vec<PanoramaPair>, Vec<Option<VerifiedPair>>) = matched.into_iter().unzip();
     let verified: Vec<VerifiedPair> = verified.into_iter().flatten().collect();
     let known: Vec<Photo> = prepared.iter().map(|p| p.photo).collect();
     let alignment = match align(&known, &verified, &options.align, progress) {
@@ -148,6 +152,8 @@ pub(super) struct Prepared {
     /// Luma of the resized photograph.
     gray: GrayF32,
     features: Features,
+    /// The quantized descriptors of the features, if their kind supports it.
+    bytes: Option<ByteDescriptors>,
     /// Why feature extraction failed.
     failure: Option<FeatureError>,
     /// Mask of the photograph.
@@ -173,7 +179,7 @@ impl Prepared {
         let photo = Photo { width, height, focal: p.focal.map(|f| f / factor), camera };
         let features = Features::new(matching.features.extractor().kind());
         let (gray, mask) = (cv_imgproc::rgb_to_gray_f32(image), p.mask.cloned());
-        Ok(Self { photo, factor, gray, features, failure: None, mask })
+        Ok(Self { photo, factor, gray, features, bytes: None, failure: None, mask })
     }
 
     /// Extracts the features at about `pixels` pixels.
@@ -192,6 +198,7 @@ impl Prepared {
         if let Some(mask) = &self.mask {
             drop_removed(&mut self.features, mask, self.factor);
         }
+        self.bytes = ByteDescriptors::new(&self.features.descriptors);
         Ok(())
     }
 
@@ -244,16 +251,74 @@ type MatchedPair = (PanoramaPair, Option<VerifiedPair>);
 /// with the upsampled octave within 0.08 px, at twice the time.
 const MIN_STRONG_INLIERS: usize = 50;
 
-/// Returns whether strong pairs connect all photographs.
-fn is_strongly_connected(n: usize, matched: &[Option<MatchedPair>]) -> bool {
-    let verified = matched.iter().flatten().filter_map(|(_, verified)| verified.as_ref());
-    let strong = verified.filter(|v| v.inliers.len() >= MIN_STRONG_INLIERS);
-    let mut sets = UnionFind::new(n);
-    strong.filter(|v| sets.union(v.a as u32, v.b as u32)).count() + 1 >= n
+/// The photographs that verified pairs connect.
+struct Components(Vec<u32>);
+
+impl Components {
+    /// Connects `n` photographs by the pairs with at least `min_inliers` inliers.
+    fn new(n: usize, matched: &[MatchedPair], min_inliers: usize) -> Self {
+        let mut sets = UnionFind::new(n);
+        for verified in matched.iter().filter_map(|(_, verified)| verified.as_ref()) {
+            if verified.inliers.len() >= min_inliers {
+                sets.union(verified.a as u32, verified.b as u32);
+            }
+        }
+        Self((0..n as u32).map(|i| sets.find(i)).collect())
+    }
+
+    fn count(&self) -> usize {
+        self.0.iter().enumerate().filter(|(i, root)| *i == **root as usize).count()
+    }
+
+    /// Returns whether the pairs connect two photographs, directly or over others.
+    fn joins(&self, a: usize, b: usize) -> bool {
+        self.0[a] == self.0[b]
+    }
+}
+
+/// Maximum number of similar photographs that each is matched with, in sets of more than twice as many plus one; as in structure from motion.
+const MAX_PARTNERS: usize = 20;
+
+/// Returns the pairs to match, sorted, with the smaller index first: all, or in large sets the most similar ones.
+fn candidate_pairs(prepared: &[Prepared], progress: &dyn Progress) -> Result<Vec<(usize, usize)>, Cancelled> {
+    let bytes = prepared.iter().map(|p| Some((&p.features.keypoints[..], p.bytes.as_ref()?)));
+    match bytes.collect::<Option<Vec<_>>>() {
+        Some(bytes) if bytes.len() > 2 * MAX_PARTNERS + 1 => similar_pairs(&bytes, MAX_PARTNERS, 0, progress),
+        _ => Ok(all_pairs(prepared.len()).collect()),
+    }
+}
+
+/// Returns all pairs of `n` photographs, sorted.
+fn all_pairs(n: usize) -> impl Iterator<Item = (usize, usize)> {
+    (0..n).flat_map(move |a| (a + 1..n).map(move |b| (a, b)))
+}
+
+/// Returns the pairs that are not among the sorted `candidates` and whose photographs no verified pairs connect.
+fn unconnected_pairs(n: usize, matched: &[MatchedPair], candidates: &[(usize, usize)]) -> Vec<(usize, usize)> {
+    let components = Components::new(n, matched, 0);
+    let is_new = |(a, b): &(usize, usize)| !components.joins(*a, *b) && candidates.binary_search(&(*a, *b)).is_err();
+    all_pairs(n).filter(is_new).collect()
+}
+
+/// Matches and verifies pairs, in their order, but for those with a photograph without features.
+fn match_pairs(
+    prepared: &[Prepared],
+    pairs: &[(usize, usize)],
+    options: &PanoramaOptions,
+    progress: &dyn Progress,
+) -> Result<Vec<MatchedPair>, Cancelled> {
+    let stage = Stage::new(progress, "match", pairs.len())?;
+    let compare = |&(a, b): &(usize, usize)| -> Result<Option<MatchedPair>, Cancelled> {
+        let pair = match_pair(prepared, a, b, options, &stage)?;
+        stage.add(1)?;
+        Ok(pair)
+    };
+    let matched = pairs.par_iter().map(compare).collect::<Result<Vec<_>, Cancelled>>()?;
+    Ok(matched.into_iter().flatten().collect())
 }
 
 /// Matches and verifies a pair; `None` where a photograph has no features.
-fn try_pair(
+fn match_pair(
     prepared: &[Prepared],
     a: usize,
     b: usize,
@@ -261,7 +326,11 @@ fn try_pair(
     progress: &dyn Progress,
 ) -> Result<Option<MatchedPair>, Cancelled> {
     let (p, q) = (&prepared[a], &prepared[b]);
-    let matches = match match_features(&p.features, &q.features, &options.matching, progress) {
+    let matches = match (&p.bytes, &q.bytes) {
+        (Some(p), Some(q)) => match_byte_descriptors(p, q, &options.matching.descriptor_matching(), progress),
+        _ => match_features(&p.features, &q.features, &options.matching, progress),
+    };
+    let matches = match matches {
         Ok(matches) => matches,
         Err(MatchError::Cancelled(stop)) => return Err(stop),
         Err(_) => return Ok(None),
@@ -339,27 +408,32 @@ mod tests {
         assert_eq!(reduced(image.view(), 10_000).map(|image| image.size()), Some((120, 80)));
     }
 
+    fn verified(a: usize, b: usize, agree: usize) -> MatchedPair {
+        let pair = PanoramaPair { a, b, matches: Vec::new(), inliers: Vec::new(), rejected: None };
+        let (inliers, matches) = ((0..agree).collect(), vec![Correspondence::new(0.0, 0.0, 0.0, 0.0); agree]);
+        (pair, Some(VerifiedPair { a, b, homography: Matrix3::identity(), inliers, matches }))
+    }
+
     #[test]
-    fn strong_connectivity_needs_strong_pairs_between_all_photographs() {
-        let link = |a: usize, b: usize, agree: usize| {
-            let pair = PanoramaPair { a, b, matches: Vec::new(), inliers: Vec::new(), rejected: None };
-            let (inliers, matches) = ((0..agree).collect(), vec![Correspondence::new(0.0, 0.0, 0.0, 0.0); agree]);
-            Some((pair, Some(VerifiedPair { a, b, homography: Matrix3::identity(), inliers, matches })))
-        };
-        let rejected = || {
-            let pair = PanoramaPair { a: 0, b: 1, matches: Vec::new(), inliers: Vec::new(), rejected: None };
-            Some((pair, None))
-        };
-        assert!(is_strongly_connected(0, &[]) && is_strongly_connected(1, &[]));
-        assert!(!is_strongly_connected(2, &[None]) && !is_strongly_connected(2, &[rejected()]));
-        assert!(is_strongly_connected(
-            3,
-            &[link(1, 2, MIN_STRONG_INLIERS), None, link(0, 2, MIN_STRONG_INLIERS), link(0, 1, 9)]
-        ));
+    fn components_are_connected_by_verified_pairs_with_enough_inliers() {
+        let count = |n, matched: &[MatchedPair]| Components::new(n, matched, MIN_STRONG_INLIERS).count();
+        let rejected = (PanoramaPair { a: 0, b: 1, matches: Vec::new(), inliers: Vec::new(), rejected: None }, None);
+        assert_eq!([count(0, &[]), count(1, &[]), count(2, &[]), count(2, &[rejected])], [0, 1, 2, 2]);
+        let strong = MIN_STRONG_INLIERS;
+        assert_eq!(count(3, &[verified(1, 2, strong), verified(0, 2, strong), verified(0, 1, 9)]), 1);
         // Two strong pairs and a weak one between them.
-        assert!(!is_strongly_connected(
-            4,
-            &[link(2, 3, MIN_STRONG_INLIERS), link(0, 1, 900), link(0, 2, MIN_STRONG_INLIERS - 1)]
-        ));
+        let matched = [verified(2, 3, strong), verified(0, 1, 900), verified(0, 2, strong - 1)];
+        let components = Components::new(4, &matched, strong);
+        assert_eq!(components.count(), 2);
+        assert!(components.joins(0, 1) && components.joins(3, 2) && !components.joins(0, 2));
+    }
+
+    #[test]
+    fn pairs_that_were_not_tried_are_those_between_components() {
+        let candidates = [(0, 1), (0, 3), (2, 3)];
+        let matched = [verified(0, 1, 9), verified(2, 3, 9)];
+        assert_eq!(unconnected_pairs(4, &matched, &candidates), [(0, 2), (1, 2), (1, 3)]);
+        assert_eq!(unconnected_pairs(4, &[verified(0, 1, 9), verified(1, 3, 9), verified(2, 3, 9)], &candidates), []);
+        assert_eq!(unconnected_pairs(3, &[], &all_pairs(3).collect::<Vec<_>>()), []);
     }
 }
