@@ -3,6 +3,7 @@
 //! A blend mode is one file of this module with a [`Blender`], a variant of [`BlendMode`] with its name, and an arm of `of_mode`. A blender of another crate is
 //! passed to [`render_with`](crate::render_with).
 
+mod composite_grid;
 mod feather;
 mod hard_seams;
 mod multiband;
