@@ -5,9 +5,11 @@
 
 mod composite_grid;
 mod feather;
+mod grid_edges;
 mod hard_seams;
 mod multiband;
 mod poisson;
+mod runs;
 
 pub(crate) use feather::MARGIN as FEATHER_MARGIN;
 pub(crate) use multiband::{CoarseCanvas, CoarseLevels, coarse_margin};

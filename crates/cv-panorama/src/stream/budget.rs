@@ -17,7 +17,7 @@ const REGISTERED_BYTES: usize = 5 << 20;
 pub(super) fn needs_whole(options: &CompositingOptions) -> Option<(&'static str, usize)> {
     match options.blend {
         _ if options.radiance => Some(("radiance", 65)),
-        BlendMode::Poisson => Some(("poisson blending", 80)),
+        BlendMode::Poisson => Some(("poisson blending", 30)),
         BlendMode::Multiband | BlendMode::Feather | BlendMode::None => None,
     }
 }
