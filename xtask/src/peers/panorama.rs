@@ -3,6 +3,7 @@
 //!
 //! Hugin takes half a minute for a set: its output is cached in `peers-panorama` of the target folder until its script changes.
 
+use super::panorama_people::{self, People};
 use super::panorama_truth::{self, Truth};
 use crate::checks::Check;
 use anyhow::{Context, Result, ensure};
@@ -72,7 +73,9 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
             Ok((*name, panorama_truth::measure(options)?))
         })
         .collect::<Result<_>>()?;
-    let checks = checks(&sets, &truths);
+    println!("{} sets with people", panorama_people::SETS);
+    let people = panorama_people::measure()?;
+    let checks = checks(&sets, &truths, &people);
     let text = page(&sets, &truths, &checks, &load);
     print!("{text}");
     super::write_section("Panoramas", &text)?;
@@ -227,7 +230,7 @@ fn mean_level(pixels: impl Iterator<Item = [u8; 3]>) -> f64 {
     sum as f64 / n.max(1) as f64
 }
 
-fn checks(sets: &[Compared], truths: &[(&str, Truth)]) -> Vec<Check> {
+fn checks(sets: &[Compared], truths: &[(&str, Truth)], people: &People) -> Vec<Check> {
     let mut checks = Vec::new();
     for set in sets {
         let (name, count) = (set.name, set.photographs as f64);
@@ -262,6 +265,14 @@ fn checks(sets: &[Compared], truths: &[(&str, Truth)]) -> Vec<Check> {
             1.5,
         ));
     }
+    checks.push(Check::at_least(
+        format!(
+            "sets with every person whole or absent ({} whole, {} absent, {} cut)",
+            people.whole, people.absent, people.cut
+        ),
+        people.sets as f64,
+        panorama_people::SETS as f64,
+    ));
     checks
 }
 

@@ -75,7 +75,7 @@ pub(super) fn measure(set: &Generated) -> Result<Truth> {
 }
 
 /// Returns the true world direction of a pixel of the panorama, from its source pixel in the photograph of its label.
-fn true_ray(photos: &[VistaPhoto], result: &PanoramaResult, x: f64, y: f64) -> Option<Vector3<f64>> {
+pub(super) fn true_ray(photos: &[VistaPhoto], result: &PanoramaResult, x: f64, y: f64) -> Option<Vector3<f64>> {
     let label = usize::from(result.labels.at((x + 0.5) as usize, (y + 0.5) as usize)[0]);
     let source = result.map.source(label, Point2::new(x, y))?;
     let photo = photos.get(label)?;

@@ -4,7 +4,7 @@ use crate::align::bundle::{Lens, Limits, Motion, Overlap, Problem, State};
 use crate::align::focal::focals_from_homography;
 use crate::align::metric::{in_front, metric_frame};
 use crate::align::straighten::straighten;
-use crate::align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, Photo, Unplaced, View};
+use crate::align::{AlignError, AlignOptions, AlignedPair, Alignment, CameraMotion, GOOD_FIT, Photo, Unplaced, View};
 use cv_core::{Camera, Cancelled, Distortion, Point2, Stage};
 use cv_geometry::{PairEdge, PairGraph, VerifiedPair};
 use cv_numeric::{RobustLoss, svd3};
@@ -188,14 +188,14 @@ impl<'a> Group<'a> {
         let flat = || self.solve_homography(options, stage);
         Ok(match (options.motion, rotation.transpose()?) {
             (CameraMotion::Auto, Some(rotation)) => {
-                let typical = self.median_error(Motion::Rotation, &rotation);
+                let typical = self.median_error(CameraMotion::Rotation, &rotation);
                 // The rotation model fits to within the σ of the loss: the homography model is not tried.
-                if typical <= 0.75 * options.outlier_px {
+                if typical <= GOOD_FIT * options.outlier_px {
                     return Ok((rotation, CameraMotion::Rotation));
                 }
                 let flat = flat()?;
                 // Model selection: the homography model has five more unknowns per photograph and must fit far better.
-                let better = self.median_error(Motion::Homography, &flat) < 0.4 * typical;
+                let better = self.median_error(CameraMotion::Homography, &flat) < 0.4 * typical;
                 if better && self.in_front(&flat) {
                     (flat, CameraMotion::Homography)
                 } else {
@@ -295,8 +295,22 @@ impl<'a> Group<'a> {
         self.overlaps.iter().map(|o| problem.squared_errors(&s.state, o)).collect()
     }
 
-    fn median_error(&self, kind: Motion, s: &Solution) -> f64 {
-        median(self.errors(kind, s).into_iter().flatten().collect()).sqrt()
+    pub(crate) fn median_error(&self, motion: CameraMotion, s: &Solution) -> f64 {
+        median(self.errors(kind_of(motion), s).into_iter().flatten().collect()).sqrt()
+    }
+
+    /// Returns the pairs without those that close a circle with less than half of the matches of every other pair of the circle along the spanning tree.
+    pub(crate) fn without_weak_closures(&self) -> Vec<&'a VerifiedPair> {
+        let edges = self.graph.edges();
+        let is_weak = |edge: usize| {
+            let PairEdge { a, b, weight } = edges[edge];
+            let mut weakest = vec![f64::INFINITY; self.photos.len()];
+            for step in self.graph.breadth_first(&self.tree, a) {
+                weakest[step.node] = weakest[step.parent].min(edges[step.edge].weight);
+            }
+            !self.tree.contains(&edge) && weight < 0.5 * weakest[b]
+        };
+        (0..edges.len()).filter(|edge| !is_weak(*edge)).map(|edge| self.pairs[edge]).collect()
     }
 
     /// Returns whether no photograph reaches the vanishing line of the plane.

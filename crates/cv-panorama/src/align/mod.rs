@@ -232,6 +232,9 @@ impl Alignment {
     }
 }
 
+/// Median transfer error relative to the scale of the loss up to which an alignment is good: other models and sets of pairs are not tried.
+const GOOD_FIT: f64 = 0.75;
+
 /// Aligns photographs by their verified pairs: initialization along the spanning tree from the center of the match graph, bundle adjustment over all
 /// overlaps with a robust loss, then leveling.
 ///
@@ -267,6 +270,19 @@ pub fn align(
     loop {
         let group = Group::largest(photos, &pairs)?;
         let (solution, motion) = group.solve(options, &stage)?;
+        let typical = group.median_error(motion, &solution);
+        if typical > GOOD_FIT * options.outlier_px {
+            // A false pair at the ends of a chain closes a circle that is none, and its residuals spread over all others.
+            let kept = group.without_weak_closures();
+            if kept.len() < group.pairs.len() {
+                let open = Group::largest(photos, &kept)?;
+                let (solution, motion) = open.solve(options, &stage)?;
+                if open.median_error(motion, &solution) < 0.5 * typical {
+                    pairs = kept;
+                    continue;
+                }
+            }
+        }
         let bad = group.worst_inconsistency(&solution, motion, options);
         if let Some(bad) = bad {
             // One at a time: a false pair raises the residuals of the pairs around it.
@@ -390,6 +406,24 @@ mod tests {
         let found = align(&photos(4), &pairs, &AlignOptions::default(), &Silent).unwrap();
         assert_eq!((found.pairs.len(), found.used().count()), (count, 4));
         assert!(rotation_error(&found, &truth) < 1e-3, "{}", rotation_error(&found, &truth));
+    }
+
+    #[test]
+    fn a_false_weak_pair_does_not_close_a_circle() {
+        // Eight photographs over 270 degrees, and nine false matches between the first and the last, which would overlap at half of the focal length.
+        let turns: Vec<(f64, f64, f64)> = (0..8).map(|i| (0.55 * f64::from(i) - 1.925, 0.0, 0.0)).collect();
+        let truth = views(&turns, 600.0);
+        let mut pairs: Vec<VerifiedPair> = (1..8).filter_map(|i| pair(i - 1, i, &truth)).collect();
+        let near = views(&[(0.0, 0.0, 0.0), (0.55, 0.0, 0.0)], 600.0);
+        let mut closing = pair(0, 1, &near).unwrap();
+        (closing.a, closing.b) = (7, 0);
+        closing.matches.truncate(9);
+        closing.inliers.truncate(9);
+        pairs.push(closing);
+        let found = align(&photos(8), &pairs, &AlignOptions::default(), &Silent).unwrap();
+        assert_eq!(found.pairs.len(), 7);
+        assert!(rotation_error(&found, &truth) < 1e-3, "{}", rotation_error(&found, &truth));
+        assert!((found.views[3].as_ref().unwrap().camera.fx - 600.0).abs() < 1.0);
     }
 
     #[test]
