@@ -20,6 +20,9 @@ const SETS: [&str; 4] = ["weir", "umd-set1", "umd-set3", "carpark"];
 /// Runs of each system on a set, of which the fastest counts; of the large set there is one.
 const RUNS: usize = 7;
 
+/// Name of the share of pixels that lost what a photograph shows.
+const LOST: &str = "share of pixels unclipped in some photograph that are clipped or flat";
+
 /// Name of the generated set of large photographs.
 const LARGE: &str = "generated, 8 of 12 Mpx";
 
@@ -46,6 +49,8 @@ struct Compared {
     photographs: usize,
     /// Smallest and largest mean gray level of a photograph.
     means: (f64, f64),
+    /// Share of the pixels unclipped in some photograph that are clipped or flat in our panorama.
+    lost: f64,
     systems: Vec<(&'static str, Outcome)>,
 }
 
@@ -56,13 +61,10 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
     let mut sets = Vec::new();
     for name in SETS {
         println!("{name}");
-        let mut photographs: Vec<PathBuf> = std::fs::read_dir(data.join("panorama").join(name))
-            .with_context(|| name.to_owned())?
-            .map(|entry| Ok(entry?.path()))
-            .collect::<Result<_>>()?;
-        photographs.sort();
+        let photographs = photographs_of(data, name)?;
         sets.push(compare(name, &photographs, python, &program, &cache)?);
     }
+    let poisson = poisson_ratio(data, python, &program, &cache)?;
     println!("{LARGE}");
     let photographs = render_large_set(&cache)?;
     sets.push(compare(LARGE, &photographs, python, &program, &cache)?);
@@ -75,11 +77,52 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
         .collect::<Result<_>>()?;
     println!("{} sets with people", panorama_people::SETS);
     let people = panorama_people::measure()?;
-    let checks = checks(&sets, &truths, &people);
+    let mut checks = checks(&sets, &truths, &people);
+    checks.push(Check::at_most("Poisson blending, s per Mpx / seamlessClone's", poisson, 0.1));
     let text = page(&sets, &truths, &checks, &load);
     print!("{text}");
     super::write_section("Panoramas", &text)?;
     Ok(checks)
+}
+
+/// Returns the files of a set, sorted.
+fn photographs_of(data: &Path, name: &str) -> Result<Vec<PathBuf>> {
+    let folder = std::fs::read_dir(data.join("panorama").join(name)).with_context(|| name.to_owned())?;
+    let mut photographs: Vec<PathBuf> = folder.map(|entry| Ok(entry?.path())).collect::<Result<_>>()?;
+    photographs.sort();
+    Ok(photographs)
+}
+
+/// Returns the seconds per megapixel of our Poisson blending, over all sets, relative to OpenCV's `seamlessClone`; the fastest of three runs each.
+fn poisson_ratio(data: &Path, python: &Path, program: &Path, cache: &Path) -> Result<f64> {
+    let (mut seconds, mut megapixels) = (0.0, 0.0);
+    for name in SETS {
+        let mut fastest = f64::INFINITY;
+        let mut size = [0.0; 2];
+        for _ in 0..3 {
+            let output = Command::new(program)
+                .args(["panorama", "--json", "--quiet", "--blend", "poisson", "--threads", &THREADS.to_string(), "-o"])
+                .arg(cache.join("poisson.png"))
+                .args(photographs_of(data, name)?)
+                .output()?;
+            ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+            let value: serde_json::Value = serde_json::from_slice(&output.stdout)?;
+            fastest = value["seconds"]["blend"].as_f64().context("no time of blending")?.min(fastest);
+            size = [0, 1].map(|i| value["size"][i].as_f64().unwrap_or(0.0));
+        }
+        seconds += fastest;
+        megapixels += size[0] * size[1] / 1e6;
+    }
+    let photographs = photographs_of(data, SETS[0])?;
+    let output = Command::new(python)
+        .arg(crate::root().join("peers/poisson_opencv.py"))
+        .arg(THREADS.to_string())
+        .args(&photographs[..2])
+        .output()
+        .context("cannot start Python")?;
+    ensure!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let opencv: f64 = String::from_utf8(output.stdout)?.trim().parse()?;
+    Ok(seconds / megapixels / opencv)
 }
 
 /// Renders eight photographs of 12 megapixels, unless their files exist.
@@ -109,11 +152,9 @@ fn compare(
     let folder = cache.join(name.replace([' ', ','], "-"));
     std::fs::create_dir_all(&folder)?;
     let scripts = crate::root().join("peers");
-    let means = photographs
-        .iter()
-        .map(|path| Ok(mean_level(cv_io::read_rgb(path)?.pixels())))
-        .collect::<Result<Vec<f64>>>()
-        .context("photographs")?;
+    let images = photographs.iter().map(|path| Ok(cv_io::read_rgb(path)?)).collect::<Result<Vec<_>>>()?;
+    let lost = panorama_truth::lost_share_of(&images)?;
+    let means: Vec<f64> = images.into_iter().map(|image| mean_level(image.pixels())).collect();
     let means = (means.iter().copied().fold(f64::MAX, f64::min), means.iter().copied().fold(0.0, f64::max));
     let run_opencv = |mode: &str| -> Result<Outcome> {
         let output = Command::new(python)
@@ -150,7 +191,7 @@ fn compare(
     {
         systems.push(("Hugin", outcome));
     }
-    Ok(Compared { name, photographs: photographs.len(), means, systems })
+    Ok(Compared { name, photographs: photographs.len(), means, lost, systems })
 }
 
 /// Replaces a run by the next if that took less processor time.
@@ -248,6 +289,7 @@ fn checks(sets: &[Compared], truths: &[(&str, Truth)], people: &People) -> Vec<C
             ours.mean,
             set.means.1 + 0.5,
         ));
+        checks.push(Check::at_most(format!("{name}: {LOST}"), set.lost, 0.005));
         // Costs are compared only if both use all photographs.
         if opencv.used == set.photographs {
             checks.push(Check::at_most(format!("{name}: processor s / OpenCV's"), ours.cpu / opencv.cpu, 0.6));
@@ -264,6 +306,7 @@ fn checks(sets: &[Compared], truths: &[(&str, Truth)], people: &People) -> Vec<C
             t.step,
             1.5,
         ));
+        checks.push(Check::at_most(format!("{name}: {LOST}"), t.lost, 0.005));
     }
     checks.push(Check::at_least(
         format!(

@@ -6,7 +6,7 @@ use cv_core::Camera;
 use cv_pipeline::{PanoramaOptions, PanoramaPhoto, PanoramaResult, Silent, panorama};
 use cv_synth::{Vista, VistaOptions, VistaPhoto, vista_photos};
 
-/// Number of generated sets, of four photographs each, with a person at another place in every photograph.
+/// Number of generated sets of eight photographs of ±1 EV with a person at another place in every one.
 pub(super) const SETS: u64 = 50;
 /// Minimum share of a person's pixels of a whole one, and of the pixels without it of an absent one: what is left are the pixels of a transition at the outline.
 const MIN_SHARE: f64 = 0.95;
@@ -27,7 +27,7 @@ pub(super) fn measure() -> Result<People> {
     let mut people = People::default();
     for seed in 1..=SETS {
         let camera = Camera::from_focal(640, 480, 600.0);
-        let options = VistaOptions { views: 4, walker: true, samples: 1, overlap: 0.5, ..VistaOptions::default() };
+        let options = VistaOptions { walker: true, samples: 1, ..VistaOptions::default() };
         let photos = vista_photos(&Vista::new(seed, 150.0), seed, &camera, &options)?;
         let inputs: Vec<PanoramaPhoto<'_>> = photos.iter().map(|p| PanoramaPhoto::new(p.image.view())).collect();
         let result = panorama(&inputs, &PanoramaOptions::default(), &Silent)?;

@@ -1,7 +1,8 @@
 //! Accuracy of a panorama of generated photographs against ground truth: drift, PSNR, steps at seams.
 
 use anyhow::Result;
-use cv_core::{Camera, Distortion, Matrix3, Point2, Vector3};
+use cv_core::{Camera, Distortion, ImageView, Matrix3, Point2, RgbU8, Vector3};
+use cv_pipeline::panorama_types::NO_PHOTO;
 use cv_pipeline::{PanoramaOptions, PanoramaPhoto, PanoramaResult, Silent, panorama};
 use cv_synth::{Vista, VistaOptions, VistaPhoto, vista_photos, vista_response};
 
@@ -28,6 +29,8 @@ pub(super) struct Truth {
     pub(super) min_psnr: f64,
     /// 95th percentile of the steps at seams, in gray levels.
     pub(super) step: f64,
+    /// Share of the pixels unclipped in some photograph that are clipped or flat in the result.
+    pub(super) lost: f64,
 }
 
 const SEEDS: [u64; 3] = [1, 2, 3];
@@ -56,18 +59,21 @@ pub(super) fn measure(set: &Generated) -> Result<Truth> {
         let steps = seam_steps(&photos, &result);
         let step = steps.get(steps.len() * 95 / 100).copied().unwrap_or(f64::NAN);
         let psnr = psnr(&vista, &photos, &result);
+        let images: Vec<ImageView<'_, u8, 3>> = photos.iter().map(|p| p.image.view()).collect();
+        let lost = lost_share(&images, &result);
         println!(
-            "  seed {seed}: used {used}, drift {:.2} {:.2}, PSNR {psnr:.1}, {} steps {step:.1}",
+            "  seed {seed}: used {used}, drift {:.2} {:.2}, PSNR {psnr:.1}, {} steps {step:.1}, lost {lost:.5}",
             drift.0,
             drift.1,
             steps.len()
         );
-        let figures = Truth { photographs: photos.len() as f64, used, drift, psnr, min_psnr: set.min_psnr, step };
+        let figures = Truth { photographs: photos.len() as f64, used, drift, psnr, min_psnr: set.min_psnr, step, lost };
         worst = Some(worst.map_or(figures, |w| Truth {
             used: w.used.min(used),
             drift: (w.drift.0.max(drift.0), w.drift.1.max(drift.1)),
             psnr: w.psnr.min(psnr),
             step: w.step.max(step),
+            lost: w.lost.max(lost),
             ..figures
         }));
     }
@@ -210,4 +216,49 @@ fn seam_steps(photos: &[VistaPhoto], result: &PanoramaResult) -> Vec<f64> {
     }
     steps.sort_by(f64::total_cmp);
     steps
+}
+
+/// Level from which a sample counts as clipped: in the photographs below white, since interpolation and noise lower it.
+const CLIPPED: [u8; 2] = [250, 254];
+/// Difference of levels in a neighborhood of a photograph that is more than noise.
+const MIN_CONTRAST: u8 = 12;
+
+/// Computes the share of the pixels unclipped in some photograph that are clipped in the result, or flat where that photograph is not; neighborhoods of 5 × 5 pixels.
+pub(super) fn lost_share(photos: &[ImageView<'_, u8, 3>], result: &PanoramaResult) -> f64 {
+    let (w, h) = result.image.size();
+    let range = |image: ImageView<'_, u8, 3>, x: usize, y: usize| -> Option<([u8; 3], [u8; 3])> {
+        let (width, height) = image.size();
+        if x < 2 || y < 2 || x + 2 >= width || y + 2 >= height {
+            return None;
+        }
+        let around = (y - 2..=y + 2).flat_map(|y| (x - 2..=x + 2).map(move |x| image.at(x, y)));
+        Some(around.fold(([255; 3], [0; 3]), |(low, high), p| {
+            (std::array::from_fn(|c| p[c].min(low[c])), std::array::from_fn(|c| p[c].max(high[c])))
+        }))
+    };
+    let (mut seen, mut lost) = (0_usize, 0_usize);
+    for (x, y) in (2..h - 2).step_by(2).flat_map(|y| (2..w - 2).step_by(2).map(move |x| (x, y))) {
+        if result.labels.at(x, y) == [NO_PHOTO] {
+            continue;
+        }
+        let ranges = photos.iter().enumerate().filter_map(|(i, photo)| {
+            let source = result.map.source(i, Point2::new(x as f64, y as f64))?;
+            let (low, high) = range(*photo, source.x.round() as usize, source.y.round() as usize)?;
+            high.iter().all(|v| *v < CLIPPED[0]).then_some((low, high))
+        });
+        let contrasts: Vec<u8> =
+            ranges.map(|(low, high)| (0..3).map(|c| high[c] - low[c]).max().unwrap_or(0)).collect();
+        let Some((low, high)) = range(result.image.view(), x, y).filter(|_| !contrasts.is_empty()) else { continue };
+        seen += 1;
+        let is_clipped = result.image.at(x, y).iter().any(|v| *v >= CLIPPED[1]);
+        lost += usize::from(is_clipped || low == high && contrasts.iter().all(|c| *c >= MIN_CONTRAST));
+    }
+    lost as f64 / seen.max(1) as f64
+}
+
+/// Computes [`lost_share`] of our panorama of photographs.
+pub(super) fn lost_share_of(photos: &[RgbU8]) -> Result<f64> {
+    let inputs: Vec<PanoramaPhoto<'_>> = photos.iter().map(|p| PanoramaPhoto::new(p.view())).collect();
+    let result = panorama(&inputs, &PanoramaOptions::default(), &Silent)?;
+    Ok(lost_share(&photos.iter().map(RgbU8::view).collect::<Vec<_>>(), &result))
 }

@@ -39,8 +39,9 @@ named!(Seams { GraphCut = "graphcut", Voronoi = "voronoi" | "middle" });
 /// the photographs agree.
 const ECCENTRICITY_COST: f32 = 4.0;
 
-/// Data term of a clipped pixel: balances a seam of 15 gray levels in every channel around a square of 60 clipped preview pixels.
-const CLIPPED_COST: f32 = 12.0;
+/// Data term of a clipped pixel: balances a seam of 15 gray levels in every channel around a square of 30 clipped preview pixels. Half of it shows clipped pixels that another photograph
+/// has unclipped; twice as much leads seams through people in front of clipped walls.
+const CLIPPED_COST: f32 = 24.0;
 /// Data term of a clipped pixel where radiance is computed: more than a seam along the border of a photograph.
 const CLIPPED_RADIANCE_COST: f32 = 400.0;
 
