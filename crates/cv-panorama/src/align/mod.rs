@@ -268,18 +268,17 @@ pub fn align(
     pairs.sort_by_key(|p| (p.a.min(p.b), p.a.max(p.b)));
     let mut inconsistent = vec![false; n];
     loop {
-        let group = Group::largest(photos, &pairs)?;
-        let (solution, motion) = group.solve(options, &stage)?;
+        let mut group = Group::largest(photos, &pairs)?;
+        let (mut solution, mut motion) = group.solve(options, &stage)?;
         let typical = group.median_error(motion, &solution);
         if typical > GOOD_FIT * options.outlier_px {
             // A false pair at the ends of a chain closes a circle that is none, and its residuals spread over all others.
             let kept = group.without_weak_closures();
             if kept.len() < group.pairs.len() {
                 let open = Group::largest(photos, &kept)?;
-                let (solution, motion) = open.solve(options, &stage)?;
-                if open.median_error(motion, &solution) < 0.5 * typical {
-                    pairs = kept;
-                    continue;
+                let (better, kind) = open.solve(options, &stage)?;
+                if open.median_error(kind, &better) < 0.5 * typical {
+                    (pairs, group, solution, motion) = (kept, open, better, kind);
                 }
             }
         }

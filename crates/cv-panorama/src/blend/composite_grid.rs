@@ -125,7 +125,7 @@ impl Level {
         level
     }
 
-    /// Returns the index of a stored cell.
+    /// Returns the index of a stored cell; that of a cell of padding for others.
     fn index(&self, x: usize, y: usize) -> usize {
         let run = self.stored[y].iter().find(|(run, _)| run.contains(&x));
         run.map_or(0, |(run, at)| at + x - run.start)
@@ -134,7 +134,9 @@ impl Level {
     /// Links the level to the coarser one, whose cells `refined` and `around` (these and those next to them) have stored children.
     fn link(&mut self, coarse: &Self, refined: &Runs, around: &Runs) {
         for (y, around) in around.iter().enumerate() {
-            let mut segment = self.rows[2 * y].start;
+            let rows = [Some(2 * y), Some(2 * y + 1).filter(|row| *row < self.height)];
+            // Number of refined runs so far.
+            let mut count = 0;
             for run in around {
                 let inner = refined[y].iter().filter(|r| r.start >= run.start && r.end <= run.end).cloned();
                 let mut start = run.start;
@@ -144,19 +146,17 @@ impl Level {
                             continue;
                         }
                         let at = coarse.index(part.start, y);
-                        let row = |fine_y: usize| (fine_y < self.height).then(|| self.index(2 * part.start, fine_y));
-                        let next_row =
-                            self.rows.get(2 * y + 1).map_or(0, |r| r.start) + segment - self.rows[2 * y].start;
+                        let segments = rows.map(|row| row.map_or(0, |row| self.rows[row].start + count));
                         self.pieces.push(Piece {
                             count: part.len(),
                             at,
                             above: if y > 0 { coarse.index(part.start, y - 1) } else { at },
                             below: if y + 1 < coarse.height { coarse.index(part.start, y + 1) } else { at },
-                            children: [row(2 * y), row(2 * y + 1)],
+                            children: rows.map(|row| row.map(|row| self.index(2 * part.start, row))),
                             child_count: (2 * part.end).min(self.width) - 2 * part.start,
-                            segments: is_refined.then_some([segment, next_row]),
+                            segments: is_refined.then_some(segments),
                         });
-                        segment += usize::from(is_refined);
+                        count += usize::from(is_refined);
                     }
                     start = inner.end;
                 }
@@ -256,11 +256,7 @@ impl Level {
         columns.clear();
         columns.extend(near.iter().zip(far).map(|(n, f)| blend(n, f)));
         for (k, out) in out.chunks_mut(2).enumerate() {
-            interpolate_pair(columns, k, |child, value| {
-                if let Some(out) = out.get_mut(child) {
-                    *out = value;
-                }
-            });
+            out.iter_mut().zip(interpolated_pair(columns, k)).for_each(|(out, value)| *out = value);
         }
         for s in &self.segments[self.rows[y].clone()] {
             out[s.start..s.start + s.count].copy_from_slice(&self.value[s.at..s.at + s.count]);
@@ -274,21 +270,21 @@ fn blend(near: &Pixel, far: &Pixel) -> Pixel {
     std::array::from_fn(|c| 0.75 * near[c] + 0.25 * far[c])
 }
 
-/// Interpolates the two children of cell `k` in a row whose first cell is `columns[1]`; outside the image only 0.
+/// Returns the values at the two children of cell `k` in a row whose first cell is `columns[1]`; outside the image only 0.
 #[inline(always)]
-fn interpolate_pair(columns: &[Pixel], k: usize, mut out: impl FnMut(usize, Pixel)) {
-    for (child, far) in [(0, &columns[k]), (1, &columns[k + 2])] {
+fn interpolated_pair(columns: &[Pixel], k: usize) -> [Pixel; 2] {
+    [&columns[k], &columns[k + 2]].map(|far| {
         let sum = blend(&columns[k + 1], far);
         // The weight of the cells inside the image.
         let factor = if sum[3] > 0.0 { 1.0 / sum[3] } else { 0.0 };
-        out(child, sum.map(|s| s * factor));
-    }
+        sum.map(|s| s * factor)
+    })
 }
 
 /// A composite grid, the finest level first.
 pub(crate) struct CompositeGrid {
     levels: Vec<Level>,
-    /// All values of the second level, row by row with a cell of padding on both sides; of the first one if it is the only one.
+    /// All values of the second level, row by row with a cell of padding on both sides.
     coarse_values: Vec<Pixel>,
 }
 
@@ -354,7 +350,7 @@ impl CompositeGrid {
         }
         // All values of each level but the finest, from coarse to fine.
         let mut columns = Vec::new();
-        for level in (1.min(count - 1)..count).rev() {
+        for level in (1..count).rev() {
             let fine = &self.levels[level];
             let stride = fine.width + 2;
             let mut values = vec![[0.0; 4]; stride * fine.height];
@@ -413,7 +409,10 @@ fn restrict(fine: &Level, coarse: &mut Level) {
         sums.resize(first + piece.count, [[0.0; 4]; 2]);
         let sums = &mut sums[first..];
         for (segment, child) in segments.into_iter().zip(piece.children) {
-            let (Some(_), s) = (child, &fine.segments[segment]) else { continue };
+            if child.is_none() {
+                continue;
+            }
+            let s = &fine.segments[segment];
             residuals.clear();
             fine.residuals((s.at, s.above, s.below), s.count, s.is_uniform, &mut residuals);
             let values = fine.value[s.at..s.at + s.count].chunks(2);
@@ -470,13 +469,11 @@ fn prolong(fine: &mut Level, coarse: &Level, is_correction: bool) {
                 columns.extend(values.map(|(n, f)| blend(n, f)));
             }
             for (k, out) in fine.value[child..child + piece.child_count].chunks_mut(2).enumerate() {
-                interpolate_pair(&columns, k, |i, value| {
-                    if let Some(out) = out.get_mut(i) {
-                        let (inside, kept) = (out[3], if adds { 1.0 } else { 0.0 });
-                        let [r, g, b, _]: Pixel = std::array::from_fn(|c| kept * out[c] + inside * value[c]);
-                        *out = [r, g, b, inside];
-                    }
-                });
+                for (out, value) in out.iter_mut().zip(interpolated_pair(&columns, k)) {
+                    let (inside, kept) = (out[3], if adds { 1.0 } else { 0.0 });
+                    let [r, g, b, _]: Pixel = std::array::from_fn(|c| kept * out[c] + inside * value[c]);
+                    *out = [r, g, b, inside];
+                }
             }
         }
     }
