@@ -31,6 +31,7 @@ mod distortion;
 mod features;
 mod geodetic;
 mod image;
+mod joined_ranges;
 mod luma;
 mod named;
 mod option_error;
@@ -56,6 +57,7 @@ pub use distortion::{
 pub use features::{Correspondence, DMatch, Keypoint};
 pub use geodetic::{GeodeticPoint, east_north_up};
 pub use image::{GrayF32, GrayU8, Image, ImageError, Mask, RgbF32, RgbU8, Sample};
+pub use joined_ranges::joined_ranges;
 pub use luma::{luma_f32, luma_u8, luma_u16};
 pub use named::{Named, UnknownName};
 pub use option_error::OptionError;

@@ -10,7 +10,7 @@
 use crate::PixelState;
 use crate::census::{Gray, MARGIN};
 use crate::winner::Winner;
-use cv_core::{Mask, UnionFind};
+use cv_core::{Mask, UnionFind, joined_ranges};
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -188,16 +188,7 @@ impl BorderMask {
         let rows = (0..height).into_par_iter().map(|y| {
             let rows = y.saturating_sub(1)..(y + 2).min(height);
             let grown = rows.flat_map(|y| self.row(y)).map(|run| run.start.saturating_sub(1)..run.end + 1);
-            let mut grown: Vec<Range<u32>> = grown.map(|run| run.start..run.end.min(width as u32)).collect();
-            grown.sort_unstable_by_key(|run| run.start);
-            let mut merged: Vec<Range<u32>> = Vec::with_capacity(grown.len());
-            for run in grown {
-                match merged.last_mut() {
-                    Some(last) if run.start <= last.end => last.end = last.end.max(run.end),
-                    _ => merged.push(run),
-                }
-            }
-            merged
+            joined_ranges(grown.map(|run| run.start..run.end.min(width as u32)).collect())
         });
         Self::from_rows(width, rows.collect())
     }

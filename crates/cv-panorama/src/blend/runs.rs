@@ -1,27 +1,16 @@
 //! Sets of cells of a grid as runs of each row.
 
+use cv_core::joined_ranges;
 use std::ops::Range;
 
 /// Runs of cells of each row, ascending and disjoint.
 pub(crate) type Runs = Vec<Vec<Range<usize>>>;
 
-/// Joins overlapping and adjacent runs.
-fn joined(mut runs: Vec<Range<usize>>) -> Vec<Range<usize>> {
-    runs.sort_unstable_by_key(|r| r.start);
-    let mut joined: Vec<Range<usize>> = Vec::with_capacity(runs.len());
-    for run in runs {
-        match joined.last_mut() {
-            Some(last) if run.start <= last.end => last.end = last.end.max(run.end),
-            _ => joined.push(run),
-        }
-    }
-    joined
-}
-
 /// Returns the cells of half resolution that contain one of these cells.
 pub(crate) fn coarse_runs(rows: &Runs) -> Runs {
-    let coarse =
-        |pair: &[Vec<Range<usize>>]| joined(pair.iter().flatten().map(|r| r.start / 2..r.end.div_ceil(2)).collect());
+    let coarse = |pair: &[Vec<Range<usize>>]| {
+        joined_ranges(pair.iter().flatten().map(|r| r.start / 2..r.end.div_ceil(2)).collect())
+    };
     rows.chunks(2).map(coarse).collect()
 }
 
@@ -29,7 +18,9 @@ pub(crate) fn coarse_runs(rows: &Runs) -> Runs {
 pub(crate) fn dilated(rows: &Runs, width: usize, radius: usize) -> Runs {
     let near = |y: usize| {
         let rows = &rows[y.saturating_sub(radius)..(y + radius + 1).min(rows.len())];
-        joined(rows.iter().flatten().map(|r| r.start.saturating_sub(radius)..(r.end + radius).min(width)).collect())
+        joined_ranges(
+            rows.iter().flatten().map(|r| r.start.saturating_sub(radius)..(r.end + radius).min(width)).collect(),
+        )
     };
     (0..rows.len()).map(near).collect()
 }
@@ -53,7 +44,7 @@ mod tests {
     fn sets_are_those_of_the_definitions() {
         let (width, height) = (23, 17);
         let is_in = |x: usize, y: usize| (x * 7 + y * 13).is_multiple_of(37) || (x, y) == (22, 16);
-        let row = |y: usize| joined((0..width).filter(|x| is_in(*x, y)).map(|x| x..x + 1).collect());
+        let row = |y: usize| joined_ranges((0..width).filter(|x| is_in(*x, y)).map(|x| x..x + 1).collect());
         let rows: Runs = (0..height).map(row).collect();
         let all = |w: usize, h: usize| (0..h).flat_map(move |y| (0..w).map(move |x| (x, y)));
         assert_eq!(cells(&rows), all(width, height).filter(|(x, y)| is_in(*x, *y)).collect::<Vec<_>>());

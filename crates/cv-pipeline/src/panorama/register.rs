@@ -263,7 +263,7 @@ impl Components {
                 sets.union(verified.a as u32, verified.b as u32);
             }
         }
-        Self((0..n as u32).map(|i| sets.find(i)).collect())
+        Self(sets.into_roots())
     }
 
     fn count(&self) -> usize {
