@@ -149,10 +149,9 @@ pub(crate) fn left_out(reason: &LeftOut, paths: &[PathBuf]) -> String {
         LeftOut::NoFeatures => "no features detected".to_owned(),
         LeftOut::NoOverlap { nearest: None } => "overlaps with no other photograph".to_owned(),
         LeftOut::NoOverlap { nearest: Some(pair) } => format!(
-            "overlaps with no other photograph: the best candidate, {}, has {} inliers among {} matches in the overlap, more than {:.0} are needed",
+            "overlaps with no other photograph: with the best candidate, {}, it has {} matches consistent with one homography, and more than {:.0} are needed",
             paths[pair.other].display(),
             pair.agree,
-            pair.in_overlap,
             pair.needed
         ),
         LeftOut::OtherComponent { size } => format!("belongs to a smaller connected component of {size} photographs"),
@@ -219,7 +218,7 @@ pub(crate) fn no_panorama(error: PanoramaError, paths: &[PathBuf]) -> Failure {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cv_pipeline::TwoViewError;
+    use cv_pipeline::{NearestPair, TwoViewError};
 
     #[test]
     fn advice_names_options_with_their_numbers() {
@@ -247,6 +246,13 @@ mod tests {
     fn required_memory_is_in_the_unit_of_the_option() {
         // 5 MiB and a byte.
         assert!(advice_text(Advice::MoreMemory { needed: (5 << 20) + 1 }).contains("--max-memory 6)"));
+    }
+
+    #[test]
+    fn a_photograph_without_overlap_is_compared_with_its_best_candidate() {
+        let nearest = NearestPair { other: 1, agree: 5, in_overlap: 0, needed: 8.3 };
+        let text = left_out(&LeftOut::NoOverlap { nearest: Some(nearest) }, &["a.jpg".into(), "b.jpg".into()]);
+        assert!(text.contains("b.jpg, it has 5 matches") && text.contains("more than 8 are"), "{text}");
     }
 
     #[test]
