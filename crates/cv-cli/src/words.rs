@@ -149,7 +149,7 @@ pub(crate) fn left_out(reason: &LeftOut, paths: &[PathBuf]) -> String {
         LeftOut::NoFeatures => "no features detected".to_owned(),
         LeftOut::NoOverlap { nearest: None } => "overlaps with no other photograph".to_owned(),
         LeftOut::NoOverlap { nearest: Some(pair) } => format!(
-            "overlaps with no other photograph: with the best candidate, {}, it has {} matches consistent with one homography, and more than {:.0} are needed",
+            "overlaps with no other photograph: the best candidate, {}, has {} matches consistent with one homography, and more than {:.0} are needed",
             paths[pair.other].display(),
             pair.agree,
             pair.needed
@@ -252,7 +252,7 @@ mod tests {
     fn a_photograph_without_overlap_is_compared_with_its_best_candidate() {
         let nearest = NearestPair { other: 1, agree: 5, in_overlap: 0, needed: 8.3 };
         let text = left_out(&LeftOut::NoOverlap { nearest: Some(nearest) }, &["a.jpg".into(), "b.jpg".into()]);
-        assert!(text.contains("b.jpg, it has 5 matches") && text.contains("more than 8 are"), "{text}");
+        assert!(text.contains("b.jpg, has 5 matches") && text.contains("more than 8 are"), "{text}");
     }
 
     #[test]
