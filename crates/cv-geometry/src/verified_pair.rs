@@ -48,7 +48,7 @@ pub enum PairRejection {
     NoHomography(#[from] EstimateError),
     /// The best homography has too few inliers to be significant.
     #[error(
-        "{inliers} of {in_overlap} matches in the overlap are inliers of a homography, more than {needed:.0} are needed"
+        "{inliers} inliers of a homography, but more than {needed:.0} are needed with {in_overlap} matches in the overlap"
     )]
     #[cfg_attr(feature = "serde", serde(rename = "TooFewAgree"))]
     TooFewInliers {
