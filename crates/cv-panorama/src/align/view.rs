@@ -15,10 +15,15 @@ pub struct View {
 }
 
 impl View {
-    /// Projects the direction `ray` to a pixel, which may lie outside the image; `None` behind the camera.
+    /// Projects the direction `ray` to a pixel, which may lie outside the image; `None` behind the camera and beyond the range in which the lens model is monotonic, where
+    /// directions fold back into the image.
     pub fn project(&self, ray: &Vector3<f64>) -> Option<Point2<f64>> {
         let p = self.from_world * ray;
-        (p.z > 1e-9 * p.norm()).then(|| self.camera.denormalize(Point2::new(p.x / p.z, p.y / p.z)))
+        let is_in_front = p.z > 1e-9 * p.norm();
+        if !is_in_front {
+            return None;
+        }
+        self.camera.denormalize_in_range(Point2::new(p.x / p.z, p.y / p.z))
     }
 
     /// Back-projects a pixel to a world direction of unit length; `None` outside the range of the distortion model.
@@ -71,6 +76,16 @@ mod tests {
             prop_assert!((view.project(&(ray * 7.0)).unwrap() - Point2::new(x, y)).norm() < 1e-6);
             prop_assert_eq!(view.project(&-ray), None);
         }
+    }
+
+    #[test]
+    fn a_direction_beyond_the_range_of_the_lens_is_not_seen() {
+        let camera = Camera { distortion: Distortion::simple_radial(-0.2), ..Camera::from_focal(640, 480, 600.0) };
+        let view = View { camera, from_world: Matrix3::identity() };
+        // The distorted radius r (1 − 0.2 r²) increases up to r = √(5/3) = 1.29 and is 0.2 again at 2.13, inside the image.
+        assert!(view.contains(camera.denormalize(Point2::new(2.13, 0.0))));
+        assert_eq!(view.project(&Vector3::new(2.13, 0.0, 1.0)), None);
+        assert!(view.project(&Vector3::new(1.28, 0.0, 1.0)).is_some_and(|p| !view.contains(p)));
     }
 
     #[test]

@@ -126,17 +126,10 @@ pub(crate) struct Shown {
 /// The bounding box of a region clipped to a window is that of the region's border inside the window and of the window's edges inside the region. Poles, meridians and points at
 /// infinity need no special cases. Accurate to one sample of either.
 pub(crate) fn shown(view: &View, surface: &Surface, window: &Window) -> Shown {
-    // Distortion polynomials may not be monotonic outside the photograph.
-    let border = view.border(SAMPLES_PER_SIDE);
-    let radius = |p: Point2<f64>| view.camera.normalize(p).coords.norm_squared();
-    let limit = 1.05 * border.iter().map(|p| radius(*p)).filter(|r| r.is_finite()).fold(0.0, f64::max);
-    let sees = |ray: &Vector3<f64>| {
-        let p = view.from_world * ray;
-        let near = p.z > 1e-9 * p.norm() && (p.x * p.x + p.y * p.y) <= limit * p.z * p.z;
-        near && view.project(ray).is_some_and(|q| view.contains(q))
-    };
+    let sees = |ray: &Vector3<f64>| view.project(ray).is_some_and(|q| view.contains(q));
+    let border = view.border(SAMPLES_PER_SIDE).into_iter();
     let border: Vec<Option<Point2<f64>>> =
-        border.into_iter().map(|pixel| view.ray(pixel).and_then(|ray| surface.forward(&ray))).collect();
+        border.map(|pixel| view.ray(pixel).and_then(|ray| surface.forward(&ray))).collect();
     // The border may enclose a pole or points at infinity.
     let ends = || surface.diverges() && window.edges().any(|p| window.is_end(p) && sees(&surface.inverse(p)));
     let reaches_beyond = border.iter().any(|p| p.is_none_or(|p| !window.contains(p))) || ends();
