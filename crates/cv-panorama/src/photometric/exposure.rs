@@ -42,9 +42,11 @@ impl Gains {
         Self { gains: vec![[1.0; 3]; photos], vignetting: [0.0; 2], response: [0.0; 3] }
     }
 
-    /// Returns the maximum gain in stops, 0 or more: the headroom above white.
+    /// Returns the headroom above white in stops, 0 or more: the maximum gain with the vignetting correction of a corner.
     pub(super) fn headroom_stops(&self) -> f64 {
-        f64::from(self.gains.iter().flatten().copied().fold(1.0, f32::max).log2())
+        let gain = f64::from(self.gains.iter().flatten().copied().fold(f32::MIN_POSITIVE, f32::max).log2());
+        let corner = f64::from(self.vignetting[0] + self.vignetting[1]) * std::f64::consts::LOG2_E;
+        (gain + corner.max(0.0)).max(0.0)
     }
 
     /// Returns the radiance above which a sample is clipped.
@@ -449,6 +451,18 @@ mod tests {
                 // prior of the response: 5 % of a stop for each stop.
                 assert!((f64::from(gain[c]) * factor[c] / common).log2().abs() < 0.08, "{:?}", found);
             }
+        }
+    }
+
+    #[test]
+    fn what_no_photograph_clipped_is_not_clipped_by_its_correction() {
+        // Gains of up to half a stop, and half a stop more in the corners.
+        let gains = Gains { gains: vec![[0.8; 3], [1.4; 3]], vignetting: [0.2, 0.15], response: [0.0; 3] };
+        let tone = gains.tone(1);
+        let correction = ExposureCorrection::new(&tone, &gains, 1);
+        for r2 in [0.0, 0.5, 1.0] {
+            let level = correction.levels([f32::from(CLIPPED - 1); 3], correction.vignetting_stops(r2))[0];
+            assert!((200.0..254.0).contains(&level), "{r2}: {level}");
         }
     }
 
