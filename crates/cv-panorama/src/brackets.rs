@@ -215,7 +215,6 @@ impl Stack<'_> {
 mod tests {
     use super::*;
     use crate::align::CameraMotion;
-    use crate::photometric::SATURATED_LEVEL;
     use crate::seams::{Seams, on_preview};
     use crate::surface::Bounds;
     use crate::testing::{drawn, stage};
@@ -270,16 +269,8 @@ mod tests {
                 (255.0 * (light(x, y) * 4.0_f32.powi(k as i32 - 1)).min(1.0).powf(1.0 / 2.2)).round()
             };
             let warped = drawn(bounds, |x, y| [level(x, y) as u8; 3]);
-            let clipped = warped.pixels.pixels().map(|p| p[0] >= SATURATED_LEVEL).collect();
             let n = SIZE.0 * SIZE.1;
-            Piece {
-                warped,
-                radius: vec![0.0; n],
-                eccentricity: vec![0.3; n],
-                clipped,
-                mean_level: 100.0,
-                cost: Vec::new(),
-            }
+            Piece::new(warped, vec![0.3; n], vec![0.0; n], 100.0)
         };
         let pieces = (0..3).map(piece).collect();
         (Preview { step: 1, width: SIZE.0, height: SIZE.1, pieces }, gains(&[2.0, 0.0, -2.0]))

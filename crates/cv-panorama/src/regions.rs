@@ -114,14 +114,7 @@ mod tests {
         let boxes = [(0, 20), (10, 30)].map(|(left, right)| Bounds { left, top: 0, right, bottom: SIZE.1 });
         let piece = |bounds: &Bounds| {
             let n = bounds.width() * bounds.height();
-            Piece {
-                warped: drawn(*bounds, |_, _| [9; 3]),
-                eccentricity: vec![0.0; n],
-                radius: vec![0.0; n],
-                clipped: vec![false; n],
-                mean_level: 9.0,
-                cost: Vec::new(),
-            }
+            Piece::new(drawn(*bounds, |_, _| [9; 3]), vec![0.0; n], vec![0.0; n], 9.0)
         };
         let preview = Preview { step: 4, width: SIZE.0, height: SIZE.1, pieces: boxes.iter().map(piece).collect() };
         let view = View { camera: Camera::from_focal(80, 80, 80.0), from_world: Matrix3::identity() };

@@ -348,9 +348,8 @@ mod tests {
             let color = move |_: usize, y: usize| [level(exposure * if y < 20 { 0.4 } else { 0.02 }); 3];
             let eccentricity: Vec<f32> = (0..60 * 40).map(|i| (((i % 60) as f32 - 29.5) / 30.0).powi(2)).collect();
             let warped = drawn(bounds, color);
-            let clipped = warped.pixels.pixels().map(|p| p[0] >= SATURATED_LEVEL).collect();
             let radius = eccentricity.iter().map(|e| 0.7 * e).collect();
-            Piece { warped, radius, eccentricity, clipped, mean_level: 0.0, cost: Vec::new() }
+            Piece::new(warped, eccentricity, radius, 0.0)
         });
         let preview = Preview { step: 1, width: 90, height: 40, pieces: pieces.collect() };
         let gain = |stops: f32| [stops.exp2(); 3];

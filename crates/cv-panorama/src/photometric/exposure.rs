@@ -384,11 +384,10 @@ mod tests {
 
     /// A piece that shows its whole photograph.
     fn piece(bounds: Bounds, pixels: Image<u8, 4>, radius: Vec<f32>) -> Piece {
-        let clipped = vec![false; radius.len()];
         let colors = pixels.pixels().flat_map(|p| [p[0], p[1], p[2]]);
         let mean_level = colors.map(f64::from).sum::<f64>() / (3 * radius.len()) as f64;
         let warped = WarpedPhoto { bounds, pixels };
-        Piece { warped, eccentricity: radius.clone(), radius, clipped, mean_level, cost: Vec::new() }
+        Piece::new(warped, radius.clone(), radius, mean_level)
     }
 
     /// Three photographs of 60 x 40, 30 apart, of one scene, their light multiplied by known factors and less toward their corners.

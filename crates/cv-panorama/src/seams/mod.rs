@@ -5,6 +5,7 @@
 //! preview first, then in full resolution in a band around the seams.
 
 mod alpha_expansion;
+mod contradiction;
 mod cost;
 mod misalignment;
 mod transient;
@@ -18,6 +19,7 @@ use crate::blend::NO_PHOTO;
 use crate::rows::{for_each_row, is_check_due};
 use crate::surface::{Bounds, Piece, Preview, WarpedPhoto};
 use alpha_expansion::Labeling;
+use contradiction::contradiction;
 use cost::difference;
 use cv_core::{Cancelled, Image, Progress, Stage, named};
 use misalignment::Misalignments;
@@ -39,9 +41,9 @@ named!(Seams { GraphCut = "graphcut", Voronoi = "voronoi" | "middle" });
 /// the photographs agree.
 const ECCENTRICITY_COST: f32 = 4.0;
 
-/// Data term of a clipped pixel: balances a seam of 15 gray levels in every channel around a square of 30 clipped preview pixels. Half of it shows clipped pixels that another photograph
-/// has unclipped; twice as much leads seams through people in front of clipped walls.
-const CLIPPED_COST: f32 = 24.0;
+/// Data term of a clipped pixel: balances a seam of 15 gray levels in every channel around a square of 20 clipped preview pixels. Two thirds of it show clipped pixels that another photograph
+/// has unclipped; more leads seams through people in front of clipped walls.
+const CLIPPED_COST: f32 = 36.0;
 /// Data term of a clipped pixel where radiance is computed: more than a seam along the border of a photograph.
 const CLIPPED_RADIANCE_COST: f32 = 400.0;
 
@@ -116,7 +118,8 @@ pub(crate) fn on_preview(
             for (x, y) in (top..top + block).flat_map(|y| (left..left + block).map(move |x| (x, y))) {
                 let off = preview.step as f32 * found.at(a, b, x, y) - 1.0;
                 let misaligned = (MISALIGNMENT_COST * off.clamp(0.0, MAX_MISALIGNMENT_PX)) as i32;
-                most = most.max(difference(pieces[a], pieces[b], x, y) + misaligned);
+                let cost = difference(pieces[a], pieces[b], x, y) + misaligned;
+                most = most.max(cost + contradiction(&preview.pieces[a], &preview.pieces[b], x, y));
             }
             most
         };
@@ -376,7 +379,7 @@ mod tests {
     fn scene(x: usize, y: usize, pole: usize) -> [u8; 3] {
         let wave = (90.0 + 40.0 * (x as f64 * 0.21).sin() + 30.0 * (y as f64 * 0.17 + x as f64 * 0.05).cos()) as u8;
         if (pole..pole + 10).contains(&x) && (15..75).contains(&y) {
-            [250, 30 + (y % 3) as u8, 10]
+            [240, 30 + (y % 3) as u8, 10]
         } else {
             [wave, wave, 90]
         }
@@ -392,14 +395,7 @@ mod tests {
             let eccentricity: Vec<f32> = (0..bounds.width() * bounds.height())
                 .map(|i| ((place(i).0 as f32 + 0.5 - middle) / across).powi(2))
                 .collect();
-            Piece {
-                warped: drawn(bounds, |x, y| scene(x, y, pole)),
-                radius: eccentricity.clone(),
-                clipped: vec![false; eccentricity.len()],
-                eccentricity,
-                mean_level: 0.0,
-                cost: Vec::new(),
-            }
+            Piece::new(drawn(bounds, |x, y| scene(x, y, pole)), eccentricity.clone(), eccentricity, 0.0)
         };
         Preview { step: 1, width: SIZE.0, height: SIZE.1, pieces: vec![piece(0, 120, 70), piece(40, 160, 82)] }
     }

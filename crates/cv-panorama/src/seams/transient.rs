@@ -70,8 +70,7 @@ mod tests {
                 if is_person(x, y) { [200, 40, 60] } else { [(90 + x % 7) as u8, (100 + y % 5) as u8, 110] }
             };
             let warped = drawn(bounds, color);
-            let (radius, clipped) = (eccentricity.clone(), vec![false; n]);
-            Piece { warped, radius, eccentricity, clipped, mean_level: 100.0, cost: Vec::new() }
+            Piece::new(warped, eccentricity.clone(), eccentricity, 100.0)
         };
         Preview { step: 1, width: SIZE.0, height: SIZE.1, pieces: (0..photographs).map(piece).collect() }
     }

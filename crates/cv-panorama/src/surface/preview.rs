@@ -28,6 +28,8 @@ pub(crate) struct Piece {
     pub(crate) radius: Vec<f32>,
     /// Whether the photograph is clipped in a channel.
     pub(crate) clipped: Vec<bool>,
+    /// Levels of the panorama that a clipped sample reaches at least, in the center of the photograph.
+    pub(crate) clipped_level: [u8; 3],
     /// Mean level of the photograph's samples.
     pub(crate) mean_level: f64,
     /// Data term of the seams at each pixel, for photographs of exposure brackets; empty for none.
@@ -37,9 +39,28 @@ pub(crate) struct Piece {
 /// Pixels that are corrected at once.
 const BLOCK: usize = 64;
 
+/// Level of a photograph whose correction bounds that of its clipped samples from below. It is lower than [`SATURATED_LEVEL`] by half a stop, since previews are averages.
+const CLIPPED_LEVEL: u8 = 224;
+
 impl Piece {
+    /// Returns a piece without exposure correction, clipped where a channel of its pixels is.
+    pub(crate) fn new(warped: WarpedPhoto, eccentricity: Vec<f32>, radius: Vec<f32>, mean_level: f64) -> Self {
+        let pixels = warped.pixels.as_slice().as_chunks::<4>().0.iter();
+        let clipped = pixels.map(|p| p[..3].iter().any(|v| *v >= SATURATED_LEVEL)).collect();
+        let clipped_level = [CLIPPED_LEVEL; 3];
+        Self { warped, eccentricity, radius, clipped, clipped_level, mean_level, cost: Vec::new() }
+    }
+
+    /// Returns whether the photograph is clipped at a pixel that it covers, and `color` is consistent with that: at least its bound in a channel.
+    pub(crate) fn is_bound_of(&self, color: [u8; 3], x: usize, y: usize) -> bool {
+        let b = self.warped.bounds;
+        self.clipped[(y - b.top) * b.width() + x - b.left]
+            && color.iter().zip(self.clipped_level).any(|(v, least)| *v >= least)
+    }
+
     #[inline(always)]
     fn correct(&mut self, correction: &ExposureCorrection<'_>, adaptation: Option<&Adaptation>) {
+        self.clipped_level = correction.levels([f32::from(CLIPPED_LEVEL); 3], 0.0).map(u8::from_f32);
         let b = self.warped.bounds;
         let blocks = self.warped.pixels.as_mut_slice().as_chunks_mut::<4>().0.chunks_mut(BLOCK);
         let ([mut reds, mut greens, mut blues], mut lifts, mut clipped) =
@@ -99,6 +120,7 @@ impl Piece {
             eccentricity: at_corners(&self.eccentricity),
             radius: at_corners(&self.radius),
             clipped: clipped.collect(),
+            clipped_level: self.clipped_level,
             mean_level: self.mean_level,
             cost: if self.cost.is_empty() { Vec::new() } else { greatest(&self.cost) },
         }
@@ -178,11 +200,9 @@ impl Preview {
             let warped = warp(photo.view(), &small, &surface, bounds, settings, stage)?;
             let (eccentricity, radius) = distances(&small, &surface);
             stage.add(1)?;
-            let pixels = warped.pixels.as_slice().as_chunks::<4>().0.iter();
-            let clipped = pixels.map(|p| p[..3].iter().any(|v| *v >= SATURATED_LEVEL)).collect();
             let samples = photo.as_slice();
             let mean_level = samples.iter().map(|v| u64::from(*v)).sum::<u64>() as f64 / samples.len().max(1) as f64;
-            Ok(Some(Piece { warped, eccentricity, radius, clipped, mean_level, cost: Vec::new() }))
+            Ok(Some(Piece::new(warped, eccentricity, radius, mean_level)))
         };
         let pieces: Vec<Option<Piece>> =
             layout.placements.par_iter().enumerate().map(draw).collect::<Result<_, Cancelled>>()?;
@@ -318,14 +338,8 @@ mod tests {
         let pixels =
             Image::from_fn(7, 5, |x, y| [(10 * x) as u8, (20 * y) as u8, 7, if (x, y) == (4, 2) { 0 } else { 255 }]);
         let numbered: Vec<f32> = (0..35).map(|i| i as f32).collect();
-        let piece = Piece {
-            warped: WarpedPhoto { bounds, pixels },
-            eccentricity: numbered.clone(),
-            radius: numbered,
-            clipped: (0..35).map(|i| i == 8).collect(),
-            mean_level: 0.0,
-            cost: Vec::new(),
-        };
+        let clipped = (0..35).map(|i| i == 8).collect();
+        let piece = Piece { clipped, ..Piece::new(WarpedPhoto { bounds, pixels }, numbered.clone(), numbered, 0.0) };
         let half = piece.halved();
         assert_eq!(half.warped.bounds, Bounds { left: 2, top: 1, right: 5, bottom: 3 });
         // Canvas pixels 4 and 5 of rows 2 and 3: the piece's columns 1 and 2, rows 0 and 1.
@@ -341,15 +355,7 @@ mod tests {
     fn half_resolution_of_one_pixel_is_empty() {
         let bounds = Bounds { left: 3, top: 2, right: 4, bottom: 3 };
         let pixels = Image::new(1, 1, [9, 9, 9, 255]);
-        let half = Piece {
-            warped: WarpedPhoto { bounds, pixels },
-            eccentricity: vec![0.0],
-            radius: vec![0.0],
-            clipped: vec![false],
-            mean_level: 9.0,
-            cost: Vec::new(),
-        }
-        .halved();
+        let half = Piece::new(WarpedPhoto { bounds, pixels }, vec![0.0], vec![0.0], 9.0).halved();
         assert!(half.warped.pixels.is_empty() && half.radius.is_empty());
     }
 

@@ -1,0 +1,66 @@
+//! Smoothness term through contradictions: places where two photographs show different objects, such as a person in one of them.
+
+use crate::surface::Piece;
+
+/// Difference of colors, in the unit of [`difference`](super::cost::difference), up to which two photographs show the same: 20 gray levels in every channel.
+const TOLERANCE: i32 = 4 * 60;
+/// Cost per unit beyond the tolerance. Eight keeps whole a person in front of a clipped wall, around whom every seam crosses clipped pixels and the edges of windows.
+const WEIGHT: i32 = 8;
+
+/// Computes the cost of a seam through a contradiction at a preview pixel, in addition to the difference: the minimum over 3 × 3 pixels of the difference of colors beyond a tolerance, weighted.
+///
+/// The minimum is 0 along edges that are displaced or bloom by a pixel, where a seam is visible but cuts nothing. What a clipped sample bounds is no contradiction.
+pub(super) fn contradiction(a: &Piece, b: &Piece, x: usize, y: usize) -> i32 {
+    let mut least: Option<i32> = None;
+    for y in y.saturating_sub(1)..=y + 1 {
+        for x in x.saturating_sub(1)..=x + 1 {
+            let (Some(c), Some(d)) = (a.warped.color(x, y), b.warped.color(x, y)) else { continue };
+            let difference: i32 = 4 * c.iter().zip(d).map(|(c, d)| (i32::from(*c) - i32::from(d)).abs()).sum::<i32>();
+            if difference <= TOLERANCE || a.is_bound_of(d, x, y) || b.is_bound_of(c, x, y) {
+                return 0;
+            }
+            least = Some(least.map_or(difference, |least| least.min(difference)));
+        }
+    }
+    least.map_or(0, |least| WEIGHT * (least - TOLERANCE))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::Bounds;
+    use crate::testing::drawn;
+
+    const BOUNDS: Bounds = Bounds { left: 3, top: 2, right: 33, bottom: 22 };
+
+    fn piece(color: impl Fn(usize, usize) -> [u8; 3]) -> Piece {
+        let n = BOUNDS.width() * BOUNDS.height();
+        Piece::new(drawn(BOUNDS, color), vec![0.0; n], vec![0.0; n], 0.0)
+    }
+
+    #[test]
+    fn a_person_is_a_contradiction_and_a_displaced_edge_is_none() {
+        let wall = piece(|_, _| [120; 3]);
+        let person = piece(|x, _| if (10..20).contains(&x) { [60; 3] } else { [120; 3] });
+        let edge = piece(|x, _| if (10..12).contains(&x) { [60; 3] } else { [120; 3] });
+        // 60 levels in three channels, of which the tolerance is a third.
+        assert_eq!(contradiction(&wall, &person, 15, 10), 8 * 4 * (180 - 60));
+        assert_eq!(contradiction(&person, &wall, 15, 10), contradiction(&wall, &person, 15, 10));
+        // At the outline, and on two columns.
+        assert_eq!(contradiction(&wall, &person, 10, 10), 0);
+        assert!((8..14).all(|x| contradiction(&wall, &edge, x, 10) == 0));
+        // At and beyond the border of the photographs.
+        assert_eq!(contradiction(&wall, &person, 15, 2), 8 * 4 * (180 - 60));
+        assert_eq!(contradiction(&wall, &person, 15, 0), 0);
+    }
+
+    #[test]
+    fn a_clipped_sample_contradicts_only_what_is_darker_than_its_bound() {
+        let sky = piece(|_, _| [255; 3]);
+        let [brighter, darker] = [230, 200].map(|level| piece(move |_, _| [level, 60, 60]));
+        assert_eq!(contradiction(&sky, &brighter, 15, 10), 0);
+        assert_eq!(contradiction(&brighter, &sky, 15, 10), 0);
+        assert!(contradiction(&sky, &darker, 15, 10) > 0);
+        assert!(contradiction(&darker, &sky, 15, 10) > 0);
+    }
+}
