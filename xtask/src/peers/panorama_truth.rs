@@ -256,9 +256,10 @@ pub(super) fn lost_share(photos: &[ImageView<'_, u8, 3>], result: &PanoramaResul
     lost as f64 / seen.max(1) as f64
 }
 
-/// Computes [`lost_share`] of our panorama of photographs.
-pub(super) fn lost_share_of(photos: &[RgbU8]) -> Result<f64> {
+/// Renders our panorama of photographs and computes its [`lost_share`].
+pub(super) fn panorama_with_lost_share(photos: &[RgbU8]) -> Result<(PanoramaResult, f64)> {
     let inputs: Vec<PanoramaPhoto<'_>> = photos.iter().map(|p| PanoramaPhoto::new(p.view())).collect();
     let result = panorama(&inputs, &PanoramaOptions::default(), &Silent)?;
-    Ok(lost_share(&photos.iter().map(RgbU8::view).collect::<Vec<_>>(), &result))
+    let lost = lost_share(&photos.iter().map(RgbU8::view).collect::<Vec<_>>(), &result);
+    Ok((result, lost))
 }

@@ -118,8 +118,9 @@ pub(crate) fn on_preview(
             for (x, y) in (top..top + block).flat_map(|y| (left..left + block).map(move |x| (x, y))) {
                 let off = preview.step as f32 * found.at(a, b, x, y) - 1.0;
                 let misaligned = (MISALIGNMENT_COST * off.clamp(0.0, MAX_MISALIGNMENT_PX)) as i32;
-                let cost = difference(pieces[a], pieces[b], x, y) + misaligned;
-                most = most.max(cost + contradiction(&preview.pieces[a], &preview.pieces[b], x, y));
+                let cost = difference(pieces[a], pieces[b], x, y);
+                let contradiction = contradiction(&preview.pieces[a], &preview.pieces[b], (x, y), cost);
+                most = most.max(cost + misaligned + contradiction);
             }
             most
         };
