@@ -83,8 +83,9 @@ fn every_part_has_the_mean_level_of_its_photograph() {
         farthest = farthest.max(off(before));
         // Nearer, unless the common exposure happens to be that of the photograph: the inner half reaches to the middle of overlaps with photographs of up to four stops more.
         assert!(off(after) < 0.6 * off(before) || off(after) < 6.0, "{index}: {own:.1}, {before:.1}, {after:.1}");
-        // Vignetting, which is corrected, is 3 % of the light on average there: two levels. The transitions to its neighbors do the rest.
-        assert!(sums[1][3] > 500.0 && (alone[2] - alone[0]).abs() < 10.0, "{index}: {alone:.1?}");
+        // Vignetting, which is corrected, is 3 % of the light on average there: two levels. The transitions to its neighbors do the rest, and the compression of highlights, by up to ten levels
+        // in the photograph that is nearly white (a mean of 235).
+        assert!(sums[1][3] > 500.0 && (alone[2] - alone[0]).abs() < 12.0, "{index}: {alone:.1?}");
     }
     assert!(farthest > 40.0, "{farthest}: the set shows no need");
 }
