@@ -51,11 +51,11 @@ impl Piece {
         Self { warped, eccentricity, radius, clipped, clipped_level, mean_level, cost: Vec::new() }
     }
 
-    /// Returns whether the photograph is clipped at a pixel that it covers, and `color` is consistent with that: at least its bound in a channel.
-    pub(crate) fn is_bound_of(&self, color: [u8; 3], x: usize, y: usize) -> bool {
+    /// Returns which channels of `color` a clipped sample at a pixel bounds from below: none where the photograph, which must cover the pixel, is not clipped.
+    pub(crate) fn is_bound_of(&self, color: [u8; 3], x: usize, y: usize) -> [bool; 3] {
         let b = self.warped.bounds;
-        self.clipped[(y - b.top) * b.width() + x - b.left]
-            && color.iter().zip(self.clipped_level).any(|(v, least)| *v >= least)
+        let clipped = self.clipped[(y - b.top) * b.width() + x - b.left];
+        std::array::from_fn(|c| clipped && color[c] >= self.clipped_level[c])
     }
 
     #[inline(always)]
