@@ -127,9 +127,8 @@ impl Stack<'_> {
     /// Returns luma before exposure compensation, and whether a channel is clipped, of a piece at a preview pixel that it covers.
     fn at(&self, k: usize, x: usize, y: usize) -> Option<(u8, bool)> {
         let piece = &self.preview.pieces[k];
-        let b = piece.warped.bounds;
         piece.warped.reaches(x, y).then(|| {
-            let i = (y - b.top) * b.width() + x - b.left;
+            let i = piece.warped.bounds.index(x, y);
             (self.lumas[k][i], piece.clipped[i])
         })
     }

@@ -128,13 +128,12 @@ impl PreviewMasks {
 
     /// Clears the opacity where another photograph is kept.
     pub(crate) fn keep(&self, preview: &mut Preview) {
-        let index = |b: Bounds, x: usize, y: usize| (y - b.top) * b.width() + x - b.left;
         // Eccentricity of a piece where it covers a pixel and is kept there.
         let kept = |k: usize, x: usize, y: usize| -> Option<f32> {
             let (flags, piece) = (self.0.get(k)?.as_ref()?, &preview.pieces[k]);
-            let is_kept = || flags[index(piece.warped.bounds, x, y)] & KEPT != 0 && piece.warped.reaches(x, y);
+            let is_kept = || flags[piece.warped.bounds.index(x, y)] & KEPT != 0 && piece.warped.reaches(x, y);
             (piece.warped.bounds.contains(x, y) && is_kept())
-                .then(|| piece.eccentricity[index(piece.warped.bounds, x, y)])
+                .then(|| piece.eccentricity[piece.warped.bounds.index(x, y)])
         };
         let keeps = |flags: &Option<Vec<u8>>| flags.as_ref().is_some_and(|flags| flags.iter().any(|f| f & KEPT != 0));
         let keepers: Vec<usize> = (0..self.0.len()).filter(|k| keeps(&self.0[*k])).collect();

@@ -112,7 +112,7 @@ impl Adaptation {
                 let mut sums = [0.0_f32; 3];
                 for ((piece, correction), target) in preview.pieces.iter().zip(&corrections).zip(&targets) {
                     let Some(color) = piece.warped.color(x, y) else { continue };
-                    let k = index(piece, x, y);
+                    let k = piece.warped.bounds.index(x, y);
                     let luma = luma_f32(color.map(f32::from));
                     let weight = well_exposed(luma / 255.0, piece.clipped[k]) * central(piece, k);
                     let guide = correction.log_luminance(luma) + correction.vignetting_stops(piece.radius[k]);
@@ -146,7 +146,7 @@ impl Adaptation {
             let b = piece.warped.bounds;
             for (x, y) in (b.top..b.bottom).flat_map(|y| (b.left..b.right).map(move |x| (x, y))) {
                 let Some(color) = piece.warped.color(x, y) else { continue };
-                let k = index(piece, x, y);
+                let k = piece.warped.bounds.index(x, y);
                 let own = correction.vignetting_stops(piece.radius[k]);
                 let guide = correction.log_luminance(luma_f32(color.map(f32::from))) + own;
                 total += 1;
@@ -214,12 +214,6 @@ impl Adaptation {
 /// Returns the mean gain of a photograph's channels in stops.
 pub(crate) fn mean_stops(gains: &Gains, photo: usize) -> f32 {
     gains.gains.get(photo).map_or(0.0, |gain| gain.iter().map(|g| g.log2()).sum::<f32>() / 3.0)
-}
-
-/// Returns the index of a canvas pixel in the vectors of a piece.
-fn index(piece: &Piece, x: usize, y: usize) -> usize {
-    let b = piece.warped.bounds;
-    (y - b.top) * b.width() + x - b.left
 }
 
 /// Returns the weight of a photograph at a pixel by its place.

@@ -211,9 +211,9 @@ fn anchor(gains: &mut Gains, preview: &Preview, photo_of: &[usize]) {
     for (x, y) in (0..width * height).step_by(step).map(|i| (i % width, i / width)) {
         let first = colors.len();
         for (piece, &photo) in preview.pieces.iter().zip(photo_of) {
-            let b = piece.warped.bounds;
             if let Some(color) = piece.warped.color(x, y) {
-                colors.push((color.map(f32::from), piece.radius[(y - b.top) * b.width() + x - b.left], photo, 0.0));
+                let radius = piece.radius[piece.warped.bounds.index(x, y)];
+                colors.push((color.map(f32::from), radius, photo, 0.0));
             }
         }
         let share = 1.0 / (colors.len() - first).max(1) as f64;
@@ -263,10 +263,7 @@ fn samples(preview: &Preview, photo_of: &[usize], stage: &Stage<'_>) -> Result<V
             for y in (common.top..common.bottom).step_by(step) {
                 for x in (common.left..common.right).step_by(step) {
                     let (Some(a), Some(b)) = (p.warped.color(x, y), q.warped.color(x, y)) else { continue };
-                    let r2 = |piece: &Piece| {
-                        let b = piece.warped.bounds;
-                        f64::from(piece.radius[(y - b.top) * b.width() + x - b.left])
-                    };
+                    let r2 = |piece: &Piece| f64::from(piece.radius[piece.warped.bounds.index(x, y)]);
                     let (Some(s), Some(t)) = (max_gradient(p, x, y, a), max_gradient(q, x, y, b)) else { continue };
                     let (a_of, b_of) = (photo_of[i], photo_of[j]);
                     let slope = f64::from(s.max(t));

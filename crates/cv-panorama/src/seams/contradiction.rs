@@ -25,7 +25,7 @@ fn least_difference(a: &Piece, b: &Piece, x: usize, y: usize) -> Option<i32> {
     for y in y.saturating_sub(1)..=y + 1 {
         for x in x.saturating_sub(1)..=x + 1 {
             let (Some(c), Some(d)) = (a.warped.color(x, y), b.warped.color(x, y)) else { continue };
-            let (above_a, above_b) = (a.is_bound_of(d, x, y), b.is_bound_of(c, x, y));
+            let (above_a, above_b) = (a.bounded_channels(d, x, y), b.bounded_channels(c, x, y));
             let off = |k: usize| if above_a[k] || above_b[k] { 0 } else { i32::from(c[k].abs_diff(d[k])) };
             let difference = 4 * (off(0) + off(1) + off(2));
             if difference <= TOLERANCE {

@@ -42,7 +42,7 @@ named!(Seams { GraphCut = "graphcut", Voronoi = "voronoi" | "middle" });
 const ECCENTRICITY_COST: f32 = 4.0;
 
 /// Data term of a clipped pixel: balances a seam of 15 gray levels in every channel around a square of 20 clipped preview pixels. Two thirds of it show clipped pixels that another photograph
-/// has unclipped; more leads seams through people in front of clipped walls.
+/// has unclipped; more leads more seams, at ±2 EV, through people in front of clipped walls.
 const CLIPPED_COST: f32 = 36.0;
 /// Data term of a clipped pixel where radiance is computed: more than a seam along the border of a photograph.
 const CLIPPED_RADIANCE_COST: f32 = 400.0;
@@ -173,8 +173,7 @@ fn nearest(preview: &Preview, x: usize, y: usize) -> u16 {
 
 /// Data term of a pixel; `clipped` is the cost of a clipped one.
 fn data_term(piece: &Piece, clipped: f32, x: usize, y: usize) -> f32 {
-    let b = piece.warped.bounds;
-    let i = (y - b.top) * b.width() + x - b.left;
+    let i = piece.warped.bounds.index(x, y);
     let own = piece.cost.get(i).copied().unwrap_or(0.0);
     ECCENTRICITY_COST * piece.eccentricity[i] + if piece.clipped[i] { clipped } else { 0.0 } + own
 }
@@ -182,12 +181,11 @@ fn data_term(piece: &Piece, clipped: f32, x: usize, y: usize) -> f32 {
 /// Returns the cost of [`transient_costs`] of a pixel, 0 without them.
 fn transient_at(costs: Option<&[Vec<f32>]>, preview: &Preview, label: usize, x: usize, y: usize) -> f32 {
     let b = preview.pieces[label].warped.bounds;
-    costs.map_or(0.0, |costs| costs[label][(y - b.top) * b.width() + x - b.left])
+    costs.map_or(0.0, |costs| costs[label][b.index(x, y)])
 }
 
 fn eccentricity(piece: &Piece, x: usize, y: usize) -> f32 {
-    let b = piece.warped.bounds;
-    piece.eccentricity[(y - b.top) * b.width() + x - b.left]
+    piece.eccentricity[piece.warped.bounds.index(x, y)]
 }
 
 /// Side, in canvas pixels, of the blocks on which seams are refined first where a preview pixel is larger.

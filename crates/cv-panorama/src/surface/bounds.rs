@@ -30,6 +30,12 @@ impl Bounds {
         x >= self.left && y >= self.top && x < self.right && y < self.bottom
     }
 
+    /// Returns the row-major index of a pixel inside.
+    #[inline(always)]
+    pub(crate) fn index(&self, x: usize, y: usize) -> usize {
+        (y - self.top) * self.width() + x - self.left
+    }
+
     /// Returns the intersection; `None` where it is empty.
     pub fn intersection(&self, other: &Self) -> Option<Self> {
         let b = Self {

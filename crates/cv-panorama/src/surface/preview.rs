@@ -39,7 +39,7 @@ pub(crate) struct Piece {
 /// Pixels that are corrected at once.
 const BLOCK: usize = 64;
 
-/// Level of a photograph whose correction bounds that of its clipped samples from below. It is lower than [`SATURATED_LEVEL`] by half a stop, since previews are averages.
+/// Level of a photograph whose correction bounds that of its clipped samples from below. It is lower than [`SATURATED_LEVEL`] by a third of a stop, since previews are averages.
 const CLIPPED_LEVEL: u8 = 224;
 
 impl Piece {
@@ -52,9 +52,8 @@ impl Piece {
     }
 
     /// Returns which channels of `color` a clipped sample at a pixel bounds from below: none where the photograph, which must cover the pixel, is not clipped.
-    pub(crate) fn is_bound_of(&self, color: [u8; 3], x: usize, y: usize) -> [bool; 3] {
-        let b = self.warped.bounds;
-        let clipped = self.clipped[(y - b.top) * b.width() + x - b.left];
+    pub(crate) fn bounded_channels(&self, color: [u8; 3], x: usize, y: usize) -> [bool; 3] {
+        let clipped = self.clipped[self.warped.bounds.index(x, y)];
         std::array::from_fn(|c| clipped && color[c] >= self.clipped_level[c])
     }
 
