@@ -8,7 +8,7 @@ use crate::zhang::intrinsics_from_homographies;
 use cv_core::{Camera, Correspondence, Distortion, LensProjection, Matrix3, Pose, Progress, Stage, Vector3, median};
 use cv_geometry::homography_from_points;
 use cv_numeric::RobustLoss;
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Maximum number of views of the initial adjustment; half as many rank the candidates.
 const INITIAL_VIEWS: usize = 12;
@@ -148,15 +148,15 @@ pub(crate) fn estimate_initial_values(
     let candidates = candidate_cameras(data, &sampled, projection);
     let stage = Stage::new(progress, "start", candidates.len())?;
     let ranking_views = sample_views(usable, INITIAL_VIEWS / 2);
-    let errors: Result<Vec<Vec<f64>>, _> = candidates
+    let errors = candidates
         .par_iter()
         .map(|cameras| {
             stage.add(1)?;
-            Ok::<_, CalibrateError>(median_errors(cameras, data, &ranking_views))
+            Ok(median_errors(cameras, data, &ranking_views))
         })
-        .collect();
+        .try_collect::<_, CalibrateError>()?;
     let mut ranked: Vec<(f64, Camera)> =
-        errors?.concat().into_iter().zip(candidates.concat()).filter(|(e, _)| e.is_finite()).collect();
+        errors.concat().into_iter().zip(candidates.concat()).filter(|(e, _)| e.is_finite()).collect();
     ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
     let model = match projection {
         LensProjection::Perspective => cv_core::DistortionModel::RadialTangential4,

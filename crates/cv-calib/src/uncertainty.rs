@@ -1,8 +1,8 @@
 //! Projection uncertainty over the image, and coverage by corners.
 
 use cv_core::{Camera, Point2, Point3, Vector3};
+use cv_parallel::prelude::*;
 use nalgebra::{DMatrix, Matrix2, Matrix6, SMatrix, SVector};
-use rayon::prelude::*;
 
 /// Maximum number of corners that the implied transformation is fitted to.
 const MAX_POINTS: usize = 2000;

@@ -7,7 +7,7 @@
 //! corners are pruned before: about O(n log n), with the same result.
 
 use cv_core::Keypoint;
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Number of corners in a leaf of the tree.
 const LEAF_SIZE: usize = 8;

@@ -10,7 +10,7 @@ use crate::sift::{MIN_SIDE, SiftOptions, sift};
 use crate::simd;
 use cv_core::{GrayF32, ImageView, OptionError, Point2, Progress, Stage};
 use cv_imgproc::{Border, RemapOptions, gaussian_half_kernel, mirror_ends, warp_with};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Computes SIFT features of the image rotated by `rotation` radians and then compressed by `tilt` along x. Positions,
 /// scales and angles are in the original image.

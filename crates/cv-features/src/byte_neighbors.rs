@@ -8,8 +8,8 @@
 use crate::ByteDescriptors;
 use crate::nearest_neighbors::NONE;
 use cv_core::{Cancelled, Stage};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch, prelude::*};
-use rayon::prelude::*;
 
 /// The nearest and second-nearest neighbor of a descriptor; distances as sums of squared differences of bytes.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -189,7 +189,7 @@ fn blocked<S: Simd, P: Products<S>, const V: usize>(
             stage.add(1)?;
             Ok(nearest)
         })
-        .collect::<Result<_, Cancelled>>()?;
+        .try_collect::<_, Cancelled>()?;
     let mut forward = Vec::with_capacity(query.len());
     let mut backward = vec![(i32::MAX, NONE); if both_ways { train.len() } else { 0 }];
     for (rows, columns) in tasks {

@@ -2,7 +2,7 @@
 
 use crate::simd;
 use cv_core::{Cancelled, ImageView, OptionError};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Why features could not be computed.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -41,9 +41,12 @@ pub(crate) fn check_image(view: ImageView<'_, f32, 1>, needed: usize) -> Result<
         return Err(FeatureError::ImageTooSmall { width, height, needed });
     }
     let level = simd::level();
-    let first_row = (0..height).into_par_iter().with_min_len(64).find_first(|&y| !simd::all_finite(level, view.row(y)));
-    match first_row.and_then(|y| Some((view.row(y).iter().position(|v| !v.is_finite())?, y))) {
-        Some((x, y)) => Err(FeatureError::NotFinite { x, y }),
-        None => Ok(()),
-    }
+    let rows = (0..height).into_par_iter().with_min_len(64);
+    rows.try_for_each(|y| {
+        if simd::all_finite(level, view.row(y)) {
+            return Ok(());
+        }
+        let x = view.row(y).iter().position(|v| !v.is_finite());
+        x.map_or(Ok(()), |x| Err(FeatureError::NotFinite { x, y }))
+    })
 }

@@ -5,9 +5,9 @@ use crate::nearest_neighbors::ssd;
 use crate::simd;
 use crate::{ByteDescriptors, DescriptorKind, Descriptors, Features};
 use cv_core::{Cancelled, DMatch, Keypoint, OptionError, Progress, Stage};
+use cv_parallel::prelude::*;
 use fearless_simd::{dispatch, prelude::*};
 use nalgebra::{Matrix3, Point2, Vector3};
-use rayon::prelude::*;
 
 /// Two-view geometry in pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -238,7 +238,7 @@ impl<'a, R: Comparable> Search<'a, R> {
                 let to = (from + TASK_FEATURES).min(self.a.1.len());
                 dispatch!(level, simd => self.task(simd, from, to, stage))
             })
-            .collect::<Result<_, Cancelled>>()?;
+            .try_collect::<_, Cancelled>()?;
         let mut forward = Vec::with_capacity(self.a.1.len());
         let mut backward = vec![NO_MATCH; self.b.1.len()];
         for (best, nearest) in tasks {

@@ -9,8 +9,8 @@ use crate::simd;
 use crate::structure_tensor::{RowStream, StructureTensor};
 use cv_core::{Cancelled, GrayF32, ImageView, Keypoint, OptionError, Progress, Stage};
 use cv_imgproc::gaussian_half_kernel;
+use cv_parallel::prelude::*;
 use fearless_simd::Level;
-use rayon::prelude::*;
 use std::ops::Range;
 
 /// The corner measure, a function of the eigenvalues λ₁ ≤ λ₂ of the structure tensor.
@@ -131,7 +131,7 @@ pub(crate) fn corners(
     let strips: Vec<(f32, Vec<Keypoint>)> = (0..h.div_ceil(rows))
         .into_par_iter()
         .map(|i| strip_corners(plan, threshold, i * rows..((i + 1) * rows).min(h), &stage))
-        .collect::<Result<_, _>>()?;
+        .try_collect()?;
     let max = strips.iter().fold(0.0f32, |m, s| m.max(s.0));
     let mut corners: Vec<Keypoint> = strips.into_iter().flat_map(|s| s.1).collect();
     corners.retain(|c| c.response >= threshold * max);

@@ -13,7 +13,7 @@ use crate::structure_tensor::StructureTensor;
 use crate::{DescriptorKind, DropReason, Dropped, Features};
 use cv_core::{Cancelled, ImageView, Keypoint, OptionError, Progress, Stage};
 use cv_imgproc::gaussian_half_kernel;
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Options of [`harris_laplace`].
 #[derive(Debug, Clone, PartialEq)]
@@ -181,7 +181,7 @@ fn detect(pyramid: &Pyramid, options: &MultiScaleOptions, progress: &dyn Progres
         // The structure tensor is of degree two in the gradients, Harris's measure of degree four.
         let power = if matches!(options.measure, CornerMeasure::ShiTomasi) { 2 } else { 4 };
         let gain = level.sigma.powi(power);
-        all.par_extend(candidates.par_iter().with_min_len(64).filter_map(|corner| {
+        let keypoints = candidates.par_iter().with_min_len(64).map(|corner| {
             let (x, y) = (corner.position.x * level.pixel, corner.position.y * level.pixel);
             let mut scale = level.sigma * level.pixel;
             if options.laplacian {
@@ -195,7 +195,8 @@ fn detect(pyramid: &Pyramid, options: &MultiScaleOptions, progress: &dyn Progres
                 scale *= 2f32.powf(offset.clamp(-0.5, 0.5) / pyramid.per_octave as f32);
             }
             Some(Keypoint { scale, ..Keypoint::new(x, y, gain * corner.response) })
-        }));
+        });
+        all.extend(keypoints.collect().into_iter().flatten());
         stage.add(1)?;
     }
     let strongest = all.iter().fold(0.0f32, |m, k| m.max(k.response));
@@ -217,7 +218,7 @@ fn describe(
         Ok(patch(pyramid, size, keypoint, options))
     };
     let patches: Vec<Result<(f32, Patch), DropReason>> =
-        keypoints.par_iter().with_min_len(32).map(describe_one).collect::<Result<_, _>>()?;
+        keypoints.par_iter().with_min_len(32).map(describe_one).try_collect()?;
     let mut out = Features::new(DescriptorKind::MOPS);
     for (index, (keypoint, patch)) in keypoints.iter().zip(patches).enumerate() {
         match patch {

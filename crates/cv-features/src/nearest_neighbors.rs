@@ -7,8 +7,8 @@
 
 use crate::Descriptors;
 use cv_core::{Cancelled, Progress, Stage};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch, prelude::*};
-use rayon::prelude::*;
 
 /// The nearest and second-nearest neighbor of a descriptor.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -119,7 +119,7 @@ fn blocked<S: Simd, const V: usize>(
             stage.add(1)?;
             Ok(nearest)
         })
-        .collect::<Result<_, Cancelled>>()?;
+        .try_collect::<_, Cancelled>()?;
     let mut forward = Vec::with_capacity(query.len());
     let mut backward = vec![(f32::NEG_INFINITY, NONE); if both_ways { train.len() } else { 0 }];
     for (rows, columns) in tasks {

@@ -8,7 +8,7 @@ use crate::kind::{ByteScale, MAX_SSD, RATIO};
 use crate::{DescriptorKind, DropReason, Dropped, Features};
 use cv_core::{GrayF32, ImageView, Keypoint, OptionError};
 use cv_imgproc::{bilinear_at, gaussian_blur};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Samples along a side of a patch.
 pub(crate) const SIDE: usize = 8;

@@ -2,7 +2,7 @@
 
 use cv_core::{Cancelled, GrayF32, ImageView, Progress, Stage};
 use cv_imgproc::{bilinear_at, gaussian_blur};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 use std::iter::successors;
 
 /// Assumed blur σ of the input image, in pixels (Lowe).

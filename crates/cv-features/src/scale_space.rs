@@ -11,8 +11,8 @@ use crate::scale_recipes::{DEPENDENCY_MARGIN_PAIRS, Dependencies, Recipe, recipe
 use crate::simd;
 use cv_core::{Cancelled, GrayF32, Image, ImageView, Progress, Stage};
 use cv_imgproc::{mirror_ends, mirror_index};
+use cv_parallel::prelude::*;
 use fearless_simd::Level;
-use rayon::prelude::*;
 use std::iter::successors;
 use std::ops::Range;
 
@@ -190,7 +190,7 @@ fn process_octave(plan: &Plan<'_>, stage: &Stage<'_>) -> Result<OctaveResult, Ca
             }
             Ok(extrema)
         })
-        .collect::<Result<_, Cancelled>>()?;
+        .try_collect::<_, Cancelled>()?;
     Ok((scales, next, extrema.into_iter().flatten().collect()))
 }
 

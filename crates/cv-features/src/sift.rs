@@ -18,7 +18,7 @@ use crate::scale_space::{Octave, scale_space};
 use crate::simd;
 use crate::{DescriptorKind, DropReason, Dropped, Features};
 use cv_core::{Cancelled, ImageView, Keypoint, OptionError, Point2, Progress, Stage};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Options of [`sift`].
 #[derive(Debug, Clone, PartialEq)]
@@ -169,7 +169,7 @@ pub fn sift(
             stage.add(1)?;
             Ok((index, angles.into_iter().map(describe).collect()))
         })
-        .collect::<Result<_, Cancelled>>()?;
+        .try_collect::<_, Cancelled>()?;
     features.sort_unstable_by_key(|f| f.0);
     for (index, (keypoint, histogram, norm)) in features.into_iter().flat_map(|f| f.1).enumerate() {
         if norm <= 0.0 {

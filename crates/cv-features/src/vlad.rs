@@ -8,7 +8,7 @@ use crate::ByteDescriptors;
 use crate::byte_neighbors::{MAX_DIMENSION, TASK_QUERIES, nearest_bytes};
 use crate::simd;
 use cv_core::{Cancelled, Progress, Stage};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Iterations of k-means, after which the visual words of photographs hardly change.
 const KMEANS_ITERATIONS: usize = 8;
@@ -121,7 +121,7 @@ pub fn most_similar(
             stage.add(1)?;
             Ok(ranked.into_iter().map(|r| r.1).collect())
         })
-        .collect()
+        .try_collect()
 }
 
 /// Computes the dot product with 16 partial sums, so that it vectorizes.

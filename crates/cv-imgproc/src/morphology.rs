@@ -4,7 +4,7 @@
 //! `log₂ n` shifts, and the result is the union over the element's runs.
 
 use cv_core::{ImageView, Mask};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// A structuring element: a set of pixel offsets around its origin, the center.
 #[derive(Debug, Clone, PartialEq, Eq)]

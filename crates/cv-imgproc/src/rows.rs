@@ -1,13 +1,13 @@
 //! Parallel iteration over the rows of an image.
 
 use cv_core::{Image, Sample};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
-/// Samples per band, the unit of parallel work: tens of microseconds, against about one microsecond of overhead per task.
-const SAMPLES_PER_BAND: usize = 1 << 15;
+/// Minimum number of samples that a thread takes at a time: tens of microseconds, against about one microsecond of overhead.
+const MIN_SAMPLES: usize = 1 << 15;
 
-/// Calls `f(state, y, row)` for each row of `image`, bands of rows in parallel; `init` makes the state (buffers) of a band.
-pub(crate) fn for_rows_with<T: Sample, const C: usize, S>(
+/// Calls `f(state, y, row)` for each row of `image`, in parallel; `init` makes the state (buffers) of a thread.
+pub(crate) fn for_rows_with<T: Sample, const C: usize, S: Send>(
     image: &mut Image<T, C>,
     init: impl Fn() -> S + Sync,
     f: impl Fn(&mut S, usize, &mut [T]) + Sync,
@@ -16,26 +16,11 @@ pub(crate) fn for_rows_with<T: Sample, const C: usize, S>(
     if image.is_empty() {
         return;
     }
-    let rows = (SAMPLES_PER_BAND / stride).max(1);
-    for_each_band(image.as_mut_slice(), stride * rows, &|i, band| {
-        let mut state = init();
-        for (j, row) in band.chunks_exact_mut(stride).enumerate() {
-            f(&mut state, i * rows + j, row);
-        }
-    });
+    let rows = image.as_mut_slice().par_chunks_mut(stride).with_min_len(MIN_SAMPLES / stride);
+    rows.enumerate().for_each_init(init, |state, (y, row)| f(state, y, row));
 }
 
-/// Calls `f(i, band)` for each band of `size` samples, in parallel. Dynamic dispatch: the thread-pool code is compiled once per sample type,
-/// not once per filter.
-fn for_each_band<T: Sample>(samples: &mut [T], size: usize, f: &(dyn Fn(usize, &mut [T]) + Sync)) {
-    if samples.len() <= size {
-        f(0, samples);
-    } else {
-        samples.par_chunks_mut(size).enumerate().for_each(|(i, band)| f(i, band));
-    }
-}
-
-/// Calls `f(y, row)` for each row of `image`, bands of rows in parallel.
+/// Calls `f(y, row)` for each row of `image`, in parallel.
 pub(crate) fn for_rows<T: Sample, const C: usize>(image: &mut Image<T, C>, f: impl Fn(usize, &mut [T]) + Sync) {
     for_rows_with(image, || (), |(), y, row| f(y, row));
 }
@@ -51,18 +36,8 @@ pub(crate) fn for_rows2<T: Sample, const C: usize, U: Sample, const D: usize>(
     if first.is_empty() {
         return;
     }
-    let rows = (SAMPLES_PER_BAND / a).max(1);
-    let band = |(i, (p, q)): (usize, (&mut [T], &mut [U]))| {
-        for (j, (p, q)) in p.chunks_exact_mut(a).zip(q.chunks_exact_mut(b)).enumerate() {
-            f(i * rows + j, p, q);
-        }
-    };
-    if first.height() <= rows {
-        band((0, (first.as_mut_slice(), second.as_mut_slice())));
-    } else {
-        let pairs = first.as_mut_slice().par_chunks_mut(a * rows).zip(second.as_mut_slice().par_chunks_mut(b * rows));
-        pairs.enumerate().for_each(band);
-    }
+    let rows = first.as_mut_slice().par_chunks_mut(a).zip(second.as_mut_slice().par_chunks_mut(b));
+    rows.with_min_len(MIN_SAMPLES / a).enumerate().for_each(|(y, (p, q))| f(y, p, q));
 }
 
 #[cfg(test)]

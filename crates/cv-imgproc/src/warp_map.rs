@@ -10,8 +10,8 @@ use crate::rows::for_rows;
 use crate::sample::{bilinear_at, split_coordinate};
 use crate::{Pixel, WarpError, simd};
 use cv_core::{Image, ImageView, Mask, Point2};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch, i16x16, prelude::*, u8x16, u8x32, u16x16, u32x8};
-use rayon::prelude::*;
 
 /// Result pixels per block.
 const LANES: usize = 8;

@@ -17,7 +17,6 @@ pub mod adjust;
 mod eigen;
 mod levenberg_marquardt;
 mod linear;
-mod parallel;
 mod polynomial;
 mod robust_loss;
 
@@ -27,7 +26,6 @@ pub use linear::{
     LinearError, Svd3, null_space, null_vector, smallest_eigenvector, solve_positive_definite,
     solve_positive_definite_dense, svd3, symmetric_eigen,
 };
-pub use parallel::parallel_map;
 pub use polynomial::{
     Roots, farthest_root_cubic, real_roots, real_roots_cubic, real_roots_quadratic, real_roots_quartic,
 };

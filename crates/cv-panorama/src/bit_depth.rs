@@ -12,8 +12,8 @@ use crate::stream::{MemoryLimit, PhotoSource, RowSink, draw_streamed};
 use crate::surface::{WarpedPhoto, downsample_box};
 use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Stage};
 use cv_imgproc::{Pixel, SAMPLE_LANES, bicubic_rgb_lanes, resize_area};
+use cv_parallel::prelude::*;
 use fearless_simd::Simd;
-use rayon::prelude::*;
 use std::borrow::Cow;
 use std::ops::{Add, Mul};
 
@@ -340,7 +340,7 @@ impl<'a> EightBits<'a> {
             stage.add(1)?;
             Ok(copy)
         };
-        let copies: Vec<Option<RgbU8>> = photos.par_iter().map(copy).collect::<Result<_, Cancelled>>()?;
+        let copies: Vec<Option<RgbU8>> = photos.par_iter().map(copy).try_collect::<_, Cancelled>()?;
         Ok(Self { views: Vec::new(), copies: copies.into_iter().flatten().collect() })
     }
 

@@ -11,7 +11,7 @@ use crate::rows::for_each_row;
 use crate::surface::{Piece, Preview};
 use cv_core::{Cancelled, Mask, Point2, Stage, luma_u8};
 use cv_imgproc::{StructuringElement, dilate, erode};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Maximum displacement of a pixel between two photographs of a stack, relative to the longer side: a handheld burst. The overlap is at least 95 %.
 const MAX_SHIFT_RATIO: f64 = 0.025;
@@ -106,7 +106,7 @@ pub(crate) fn set_costs(
                 stage.check()?;
                 Ok(stack.costs(k, base, &ghosts))
             })
-            .collect::<Result<_, Cancelled>>()?;
+            .try_collect::<_, Cancelled>()?;
         for (&k, costs) in members.iter().zip(costs) {
             preview.pieces[k].cost = costs;
         }

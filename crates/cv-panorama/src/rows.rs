@@ -1,7 +1,7 @@
 //! Parallel, cancellable iteration over image rows.
 
 use cv_core::{Cancelled, Stage};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Samples processed between two checks for cancellation: a few milliseconds of the slowest loops.
 const SAMPLES_PER_CHECK: usize = 1 << 18;
@@ -10,9 +10,6 @@ const SAMPLES_PER_CHECK: usize = 1 << 18;
 pub(crate) fn is_check_due(y: usize, width: usize) -> bool {
     y.is_multiple_of((SAMPLES_PER_CHECK / width.max(1)).max(1))
 }
-
-/// Rows of one task: few enough that tasks are balanced on an image of some hundred rows.
-const ROWS_PER_TASK: usize = 8;
 
 /// Calls `work` with the index and the samples of every row of `data`, in parallel.
 ///
@@ -27,11 +24,11 @@ pub(crate) fn for_each_row<T: Send>(
     for_each_row_with(data, width, stage, || (), |(), y, row| work(y, row))
 }
 
-/// As [`for_each_row`], with a scratch buffer for the rows of one task.
+/// As [`for_each_row`], with a scratch buffer of each thread.
 ///
 /// # Errors
 /// [`Cancelled`]; rows may then be missing.
-pub(crate) fn for_each_row_with<T: Send, B>(
+pub(crate) fn for_each_row_with<T: Send, B: Send>(
     data: &mut [T],
     width: usize,
     stage: &Stage<'_>,
@@ -39,25 +36,13 @@ pub(crate) fn for_each_row_with<T: Send, B>(
     work: impl Fn(&mut B, usize, &mut [T]) + Sync,
 ) -> Result<(), Cancelled> {
     let width = width.max(1);
-    for_each_chunk(data, ROWS_PER_TASK * width, &|task, rows| {
-        let mut buffer = buffer();
-        for (row, y) in rows.chunks_mut(width).zip(ROWS_PER_TASK * task..) {
-            if is_check_due(y, width) {
-                stage.check()?;
-            }
-            work(&mut buffer, y, row);
+    data.par_chunks_mut(width).enumerate().try_for_each_init(buffer, |buffer, (y, row)| {
+        if is_check_due(y, width) {
+            stage.check()?;
         }
+        work(buffer, y, row);
         Ok(())
     })
-}
-
-/// Work on a chunk, called with its index and elements.
-type ChunkWork<'a, T> = dyn Fn(usize, &mut [T]) -> Result<(), Cancelled> + Sync + 'a;
-
-/// Calls `work` for every chunk, in parallel. By dynamic dispatch: every instance of a parallel loop takes as long to compile as a
-/// thousand lines.
-fn for_each_chunk<T: Send>(data: &mut [T], size: usize, work: &ChunkWork<'_, T>) -> Result<(), Cancelled> {
-    data.par_chunks_mut(size).enumerate().try_for_each(|(i, chunk)| work(i, chunk))
 }
 
 #[cfg(test)]

@@ -8,8 +8,8 @@ use cv_core::{Cancelled, GrayF32, ImageView, OptionError, Stage, StageClock};
 use cv_features::{
     Board, BoardError, BoardPoint, BoardSize, ChessboardOptions, FeatureError, find_board, find_chessboard,
 };
+use cv_parallel::prelude::*;
 use cv_stereo::{Rectification, RectifyOptions};
-use rayon::prelude::*;
 
 /// The calibration board on the photographs.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -281,7 +281,7 @@ fn detect_boards(
         stage.add(1)?;
         Ok(detected)
     };
-    let all = (0..views * cameras).into_par_iter().map(detect).collect::<Result<Vec<_>, Cancelled>>()?;
+    let all = (0..views * cameras).into_par_iter().map(detect).try_collect::<_, Cancelled>()?;
     let mut all = all.into_iter();
     Ok((0..views).map(|_| all.by_ref().take(cameras).collect()).collect())
 }

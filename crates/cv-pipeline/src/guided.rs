@@ -3,7 +3,7 @@
 use cv_core::{Camera, Cancelled, DMatch, Matrix3, Point2, Progress};
 pub(crate) use cv_features::GuidedOptions;
 use cv_features::{Features, MatchError, TwoViewModel, match_guided};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Matches features near each other's epipolar lines, for a fundamental matrix `f` of undistorted pixels. The matches
 /// are mutual nearest neighbors, in the order of the first image's features.

@@ -4,8 +4,8 @@ use crate::Progress;
 use crate::depth::MIN_MATCHED_FRACTION;
 use crate::reconstruct::{DenseError, DenseOptions};
 use cv_core::{Camera, Cancelled, GrayF32, ImageView, Point2, Point3, PointCloud, RgbU8, Stage, StageClock, StereoRig};
+use cv_parallel::prelude::*;
 use cv_stereo::{PixelState, RectifiedView, SceneRectification, StereoMatcher, StereoOptions};
-use rayon::prelude::*;
 
 /// Width of the invalid border in pixels: more than the radius of the matching window.
 const BORDER_PX: i64 = 4;
@@ -112,7 +112,7 @@ pub(crate) fn pair_depth(
             let count = |f: &dyn Fn(&(f32, bool, bool)) -> bool| row.iter().filter(|p| f(p)).count();
             Ok((row.iter().map(|p| p.0).collect(), count(&|p| p.1), count(&|p| p.2)))
         })
-        .collect::<Result<_, Cancelled>>()?;
+        .try_collect::<_, Cancelled>()?;
     let (confirmed, common) = rows.iter().fold((0, 0), |(a, b), row| (a + row.1, b + row.2));
     let coverage = confirmed as f64 / common.max(1) as f64;
     if coverage < MIN_MATCHED_FRACTION {
@@ -148,7 +148,7 @@ impl PairDepth {
             Ok(points.collect())
         };
         let rows: Vec<Vec<([f32; 3], [u8; 3])>> =
-            self.rows.par_iter().enumerate().map(points_of_row).collect::<Result<_, Cancelled>>()?;
+            self.rows.par_iter().enumerate().map(points_of_row).try_collect::<_, Cancelled>()?;
         let (positions, colors) = rows.into_iter().flatten().unzip();
         Ok(PointCloud::colored(positions, colors))
     }

@@ -3,7 +3,7 @@
 use crate::Progress;
 use cv_core::{Cancelled, Keypoint};
 use cv_features::{ByteDescriptors, Vocabulary, largest_keypoints, most_similar};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Number of words of the VLAD vocabulary (Jégou et al.).
 const VOCABULARY_SIZE: usize = 64;
@@ -43,7 +43,7 @@ pub(crate) fn similar_pairs(
     let described: Vec<Vec<f32>> = largest
         .par_iter()
         .map(|set| Ok(words.describe(set, progress)?.unwrap_or_default()))
-        .collect::<Result<_, Cancelled>>()?;
+        .try_collect::<_, Cancelled>()?;
     let similar = most_similar(&described, count, |a, b| a.abs_diff(b) > near, progress)?;
     let of_each = |(a, of): (usize, &Vec<usize>)| of.iter().map(|&b| (a.min(b), a.max(b))).collect::<Vec<_>>();
     let mut pairs: Vec<(usize, usize)> = similar.iter().enumerate().flat_map(of_each).collect();

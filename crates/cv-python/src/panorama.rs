@@ -10,6 +10,7 @@ use crate::photographs::{self, Ended};
 use crate::results::{self, object};
 use cv_core::{Camera, Image, ImageView, Mask, Progress, Sample};
 use cv_io::{DynImage, ExifInfo, IoError, Metadata};
+use cv_parallel::prelude::*;
 use cv_pipeline::panorama_types::{Framing, PhotoMask, PhotoSample, PhotoUse, Registration};
 use cv_pipeline::{
     FeatureOptions, PanoramaError, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama as join,
@@ -19,7 +20,6 @@ use numpy::Element;
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
-use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 
 /// The options of `panorama`.
@@ -301,8 +301,7 @@ pub(crate) fn panorama<'py>(
     }
     let sources = photographs.iter().map(Photograph::source).collect::<PyResult<Vec<_>>>()?;
     let found = arguments.run.run(py, |progress| {
-        let read: Vec<_> =
-            sources.par_iter().map(|source| source.read()).collect::<Result<_, _>>().map_err(Ended::File)?;
+        let read: Vec<_> = sources.par_iter().map(|source| source.read()).try_collect().map_err(Ended::File)?;
         if read.iter().any(Read::is_deep) {
             let read: Vec<_> = read.into_par_iter().map(|r| in_depth(r, Read::into_words)).collect();
             arguments.stitch(&read, progress).map(Joined::Words)

@@ -5,8 +5,8 @@
 
 use crate::{ColorSpace, mixture::Whitened};
 use cv_core::{Cancelled, GrayF32, ImageView, Progress, Stage};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch};
-use rayon::prelude::*;
 use std::f32::consts::{PI, TAU};
 
 /// Pixels per block.

@@ -1,10 +1,10 @@
 //! Gaussian mixture models, fitted by expectation-maximization.
 
 use cv_core::{Cancelled, Progress, Stage};
+use cv_parallel::prelude::*;
 use nalgebra::{Matrix3, Vector3};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// A weighted sample point.
@@ -382,7 +382,7 @@ fn expectation(
             }
             Ok((moments, log_likelihood))
         })
-        .collect::<Result<_, Cancelled>>()?;
+        .try_collect::<_, Cancelled>()?;
     Ok(parts.iter().fold(zero(), |(sums, total), (moments, log_likelihood)| {
         (sums.iter().zip(moments).map(|(a, b)| a.plus(b)).collect(), total + log_likelihood)
     }))

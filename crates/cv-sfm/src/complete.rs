@@ -4,7 +4,7 @@ use crate::scene::Scene;
 use crate::tracks::TrackMerger;
 use crate::{Observation, Tracks};
 use cv_core::{Keypoint, Point2, Point3, Pose, Vector3};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// A distance between feature descriptors.
 pub trait FeatureDistance: Sync {

@@ -7,7 +7,7 @@ use cv_geometry::{
     EstimateError, LocalOptimization, RobustOptions, estimate_relative_pose, estimate_rotation, normalize_matches,
     parallax_angle, triangulate,
 };
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Maximum number of pairs that are scored.
 const MAX_PAIRS: usize = 60;
@@ -42,7 +42,7 @@ pub(crate) fn initial_pairs(
     let rest = (0..MAX_PAIRS / 2).map(|i| head + (i as f64 * step) as usize).take_while(|i| *i < order.len());
     let candidates: Vec<&PairMatches> = (0..head).chain(rest).map(|i| order[i]).collect();
     let scored: Vec<Option<(f64, InitialPair)>> =
-        candidates.par_iter().map(|pair| score_pair(scene, pair, options, progress)).collect::<Result<_, _>>()?;
+        candidates.par_iter().map(|pair| score_pair(scene, pair, options, progress)).try_collect()?;
     let mut scored: Vec<(f64, InitialPair)> = scored.into_iter().flatten().collect();
     scored.sort_by(|x, y| y.0.total_cmp(&x.0).then((x.1.a, x.1.b).cmp(&(y.1.a, y.1.b))));
     Ok(scored.into_iter().map(|r| r.1).collect())

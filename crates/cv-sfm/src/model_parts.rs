@@ -2,7 +2,7 @@
 
 use crate::scene::Scene;
 use crate::view_graph::{Link, ViewGraph};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Counts of the tracks that both views of a link observe.
 #[derive(Debug, Clone, Copy, Default)]
@@ -27,7 +27,8 @@ pub(crate) fn keep_largest_consistent_component(scene: &mut Scene<'_>, graph: &V
         let SharedTracks { consistent, inconsistent } = count_shared_tracks(scene, l.a, l.b);
         consistent >= min_shared && consistent >= inconsistent
     };
-    let links = graph.links.par_iter().filter(|l| is_consistent(l)).copied().collect();
+    let links =
+        graph.links.par_iter().map(|l| is_consistent(l).then_some(*l)).collect().into_iter().flatten().collect();
     let largest = ViewGraph { views: graph.views, links }.largest_component();
     let mut inside = vec![false; scene.views.len()];
     largest.links.iter().for_each(|l| (inside[l.a], inside[l.b]) = (true, true));

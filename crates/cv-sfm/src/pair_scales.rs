@@ -6,8 +6,8 @@ use cv_core::{Camera, Cancelled, Correspondence, Stage, quantile};
 use cv_geometry::{PairEdge, PairGraph, parallax_angle, triangulate};
 use cv_numeric::RobustLoss;
 use cv_numeric::adjust::{AdjustIteration, AdjustOptions, Adjustment, Euclidean, Residual};
+use cv_parallel::prelude::*;
 use nalgebra::{SMatrix, SVector};
-use rayon::prelude::*;
 use std::ops::ControlFlow;
 
 /// Minimum number of shared points to compare the baselines of two pairs.
@@ -50,7 +50,7 @@ pub(crate) fn measure_distances(
         distances.iter_mut().for_each(|list| list.sort_unstable_by(|x, y| x.0.cmp(&y.0).then(x.1.total_cmp(&y.1))));
         Ok(distances)
     };
-    graph.links.par_iter().map(of_link).collect()
+    graph.links.par_iter().map(of_link).try_collect()
 }
 
 /// Returns the median difference over the keypoints in both lists, and their count.
@@ -122,7 +122,7 @@ pub(crate) fn estimate_baselines(
         (shared >= MIN_SHARED_POINTS).then_some((PairEdge { a: x.0, b: y.0, weight: shared as f64 }, ratio))
     };
     let (edges, ratios): (Vec<PairEdge>, Vec<f64>) =
-        candidates.par_iter().map(compare).collect::<Vec<_>>().into_iter().flatten().unzip();
+        candidates.par_iter().map(compare).collect().into_iter().flatten().unzip();
     stage.check()?;
     let mut logarithms: Vec<Option<f64>> = vec![None; links.len()];
     let Ok(comparisons) = PairGraph::new(links.len(), edges) else { return Ok(logarithms) };

@@ -4,7 +4,7 @@ use crate::pair_scales::{Distances, MIN_SHARED_POINTS};
 use crate::view_graph::{Link, PairRefusal, RefusedPair, ViewGraph};
 use crate::{PairMatches, SfmInput, SfmOptions, SfmView};
 use cv_core::{Camera, Cancelled, Point2, Point3, Pose, Stage, Vector3, quantile};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Maximum number of features that a view is probed with, sampled evenly: a ratio is then known to 2 %.
 const MAX_PROBES: usize = 600;
@@ -125,7 +125,7 @@ pub(crate) fn reject_repeated_structure(
         stage.check()?;
         Ok(match_ratios(l, &input.pairs[l.pair], &distances[l.pair], views, input, options))
     };
-    let ratios: Vec<MatchRatios> = graph.links.par_iter().map(ratios_of).collect::<Result<_, _>>()?;
+    let ratios: Vec<MatchRatios> = graph.links.par_iter().map(ratios_of).try_collect()?;
     let mut of_view: Vec<Vec<(usize, usize)>> = vec![Vec::new(); graph.views];
     for (i, l) in graph.links.iter().enumerate() {
         of_view[l.b].push((i, 0));

@@ -2,7 +2,7 @@
 
 use crate::{CameraKnowledge, SfmView, Tracks};
 use cv_core::{Camera, Point2, Point3, Pose};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Cameras, poses, points and inlier observations of a reconstruction.
 pub(crate) struct Scene<'a> {

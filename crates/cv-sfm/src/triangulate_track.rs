@@ -3,8 +3,8 @@
 use crate::scene::Scene;
 use cv_core::{Correspondence, Point3, Pose, Vector3};
 use cv_geometry::triangulate;
+use cv_parallel::prelude::*;
 use nalgebra::{Matrix2x3, Matrix3};
-use rayon::prelude::*;
 
 /// When an observation is an inlier of a point, and when a point is valid.
 #[derive(Debug, Clone, Copy, PartialEq)]

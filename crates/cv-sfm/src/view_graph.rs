@@ -7,7 +7,7 @@ use cv_core::{Camera, Cancelled, Correspondence, Pose, Progress, Stage, Vector3}
 use cv_geometry::{
     EstimateError, PairEdge, PairGraph, RobustOptions, estimate_relative_pose, normalize_matches, refine_relative_pose,
 };
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Why a verified pair of views is rejected.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -95,7 +95,7 @@ impl ViewGraph {
             let matches = input.pairs[pair].matches.len();
             Ok(pose.map(|pose| Link { pair, a, b, pose, matches }))
         };
-        let links: Vec<Option<Link>> = (0..input.pairs.len()).into_par_iter().map(link).collect::<Result<_, _>>()?;
+        let links: Vec<Option<Link>> = (0..input.pairs.len()).into_par_iter().map(link).try_collect()?;
         Ok(Self { views: input.views.len(), links: links.into_iter().flatten().collect() })
     }
 
@@ -164,7 +164,8 @@ impl ViewGraph {
 
     /// Returns the triplets with consistent rotations.
     pub(crate) fn consistent_triplets(&self) -> Vec<[usize; 3]> {
-        self.triplets().into_par_iter().filter(|t| self.triplet_angle(*t) <= MAX_TRIPLET_ANGLE).collect()
+        let is_consistent = |t: [usize; 3]| (self.triplet_angle(t) <= MAX_TRIPLET_ANGLE).then_some(t);
+        self.triplets().into_par_iter().map(is_consistent).collect().into_iter().flatten().collect()
     }
 
     /// Rejects the links without a consistent triplet, unless their matches agree with the rotation that triplets

@@ -11,7 +11,7 @@ use crate::PixelState;
 use crate::census::{Gray, MARGIN};
 use crate::winner::Winner;
 use cv_core::{Mask, UnionFind, joined_ranges};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 use std::ops::Range;
 
 /// Minimum area of a border region as a fraction of the image, along much of a side and in a corner.

@@ -1,7 +1,7 @@
 //! Parallel work whose buffers are kept: those that rayon's `for_each_init` creates are freed and mapped again many times in a call.
 
 use cv_core::Cancelled;
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 use std::sync::{Mutex, PoisonError};
 
 /// Calls `work` with each item, in parallel, and one of `buffers`, of which there is one per thread.

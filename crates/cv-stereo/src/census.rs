@@ -3,9 +3,9 @@
 
 use crate::layout::Layout;
 use crate::{Census, IntensityCost};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
-use rayon::prelude::*;
 
 /// Columns by which rows of gray levels are extended on both sides: the largest radius of a window.
 pub(crate) const MARGIN: usize = 4;
@@ -19,6 +19,13 @@ pub(crate) struct Gray {
 }
 
 impl Gray {
+    /// Returns the smallest and the largest value; 65535 and 0 of no values.
+    pub(crate) fn min_max(&self) -> (u16, u16) {
+        let of_row = |row: &[u16]| row.iter().fold((u16::MAX, 0), |(low, high), &v| (low.min(v), high.max(v)));
+        let rows = self.values.par_chunks(self.stride()).map(of_row).collect();
+        rows.iter().fold((u16::MAX, 0), |a, b| (a.0.min(b.0), a.1.max(b.1)))
+    }
+
     pub(crate) fn stride(&self) -> usize {
         self.width + 2 * MARGIN
     }
@@ -27,9 +34,7 @@ impl Gray {
     /// of the scale, as from some sensors of 12 bits, stretched from minimum to maximum.
     pub(crate) fn to_bytes(&self, out: &mut Vec<u8>) {
         out.resize(self.width * self.height, 0);
-        let ends = |row: &[u16]| row.iter().fold((u16::MAX, 0), |(low, high), &v| (low.min(v), high.max(v)));
-        let join = |a: (u16, u16), b: (u16, u16)| (a.0.min(b.0), a.1.max(b.1));
-        let (low, high) = self.values.par_chunks(self.stride()).map(ends).reduce(|| (u16::MAX, 0), join);
+        let (low, high) = self.min_max();
         let span = u32::from(high.saturating_sub(low));
         let narrow = (1..=u32::from(u16::MAX) / 4).contains(&span);
         out.par_chunks_mut(self.width.max(1)).zip(self.values.par_chunks(self.stride())).for_each(|(out, row)| {

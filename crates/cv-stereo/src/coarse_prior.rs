@@ -8,9 +8,9 @@
 
 use crate::layout::{BLOCK, MAX_VECTORS};
 use crate::options::MAX_DISPARITIES;
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
-use rayon::prelude::*;
 
 /// Radius in px of the window in which texture is measured.
 const WINDOW_RADIUS: usize = 2;
@@ -93,7 +93,7 @@ pub(crate) static PRIOR_COSTS: [[[u8; PRIOR_DISTANCES]; PRIOR_CAP as usize + 1];
 pub(crate) fn classify_texture(level: Level, gray: &[u8], width: usize, priors: &mut Vec<Prior>) -> bool {
     let height = gray.len() / width.max(1);
     priors.resize(gray.len(), Prior::default());
-    let low_texture: usize = priors
+    let low_texture = priors
         .par_chunks_mut(width.max(1))
         .enumerate()
         .map_init(
@@ -105,8 +105,8 @@ pub(crate) fn classify_texture(level: Level, gray: &[u8], width: usize, priors: 
                 dispatch!(level, simd => classify_row(simd, rows, step, column, priors))
             },
         )
-        .sum();
-    low_texture as f64 > MIN_LOW_TEXTURE * gray.len() as f64
+        .collect();
+    low_texture.iter().sum::<usize>() as f64 > MIN_LOW_TEXTURE * gray.len() as f64
 }
 
 /// Classifies the pixels of the middle one of `rows` and returns the number of those of low texture. `step` and `column` are scratch.

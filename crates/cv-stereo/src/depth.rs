@@ -1,8 +1,8 @@
 //! Depth from disparity, and triangulation of the pixels of a depth map.
 
 use cv_core::{GrayF32, ImageView, PointCloud};
+use cv_parallel::prelude::*;
 use nalgebra::Matrix4;
-use rayon::prelude::*;
 
 /// The parameters that relate disparity and depth of a rectified pair.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -7,9 +7,9 @@
 
 use crate::{PixelState, Smoothing, buffer_pool};
 use cv_core::{Cancelled, Stage};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
-use rayon::prelude::*;
 
 /// Radius of a window in px, and the spacing of its samples: 25 of 81 give the same result as all.
 const RADIUS: usize = 4;

@@ -4,8 +4,8 @@ use crate::PixelState;
 use crate::plane_cost::{self, Plane, PlaneCost, Rectangle, at};
 use cv_core::{Cancelled, Stage};
 use cv_imgproc::GridCut;
+use cv_parallel::prelude::*;
 use fearless_simd::Level;
-use rayon::prelude::*;
 
 // Set on public pairs with truth (Middlebury, DrivingStereo), together with those of [`crate::plane_cost`].
 /// Weight of the smoothness term per px of distance between the planes of neighbors. With 0.8, 2.7 % of a road's errors are above 2 px in
@@ -69,12 +69,17 @@ impl<'a> Problem<'a> {
             let step = (cost.gray(a) - cost.gray(b)).abs();
             smoothness * (-step / EDGE_GRAY).exp().max(MIN_EDGE_WEIGHT)
         };
-        let edge = |i: usize| if (i + 1).is_multiple_of(width) { 0.0 } else { weight(i, i + 1) };
-        let right = (0..pixels).into_par_iter().map(edge).collect();
-        stage.check()?;
-        let edge = |i: usize| if i + width < pixels { weight(i, i + width) } else { 0.0 };
-        let down = (0..pixels).into_par_iter().map(edge).collect();
-        stage.check()?;
+        let (mut right, mut down) = (vec![0.0; pixels], vec![0.0; pixels]);
+        let rows = right.par_chunks_mut(width.max(1)).zip(down.par_chunks_mut(width.max(1))).enumerate();
+        rows.try_for_each(|(y, (right, down))| {
+            stage.check()?;
+            let row = y * width..(y + 1) * width;
+            right.iter_mut().zip(row.start..row.end - 1).for_each(|(edge, i)| *edge = weight(i, i + 1));
+            if row.end < pixels {
+                down.iter_mut().zip(row).for_each(|(edge, i)| *edge = weight(i, i + width));
+            }
+            Ok(())
+        })?;
         Ok(Self { level, cost, states, matches, right, down, range })
     }
 

@@ -2,9 +2,9 @@
 
 use crate::census::{Gray, MARGIN};
 use cv_core::{ImageView, Sample, luma_u16};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
-use rayon::prelude::*;
 
 /// A channel type that the matcher accepts.
 pub trait Intensity: Sample {
@@ -94,17 +94,15 @@ pub(crate) fn to_gray<T: Intensity, const C: usize>(view: ImageView<'_, T, C>, o
     if view.is_empty() || C == 0 {
         return 0;
     }
-    out.values
-        .par_chunks_mut(stride)
-        .enumerate()
-        .map(|(y, row)| {
-            let count = T::gray_row(view.row(y), C, &mut row[MARGIN..MARGIN + width]);
-            let (first, last) = (row[MARGIN], row[MARGIN + width - 1]);
-            row[..MARGIN].fill(first);
-            row[MARGIN + width..].fill(last);
-            count
-        })
-        .sum()
+    let rows = out.values.par_chunks_mut(stride).enumerate();
+    let counts = rows.map(|(y, row)| {
+        let count = T::gray_row(view.row(y), C, &mut row[MARGIN..MARGIN + width]);
+        let (first, last) = (row[MARGIN], row[MARGIN + width - 1]);
+        row[..MARGIN].fill(first);
+        row[MARGIN + width..].fill(last);
+        count
+    });
+    counts.collect().iter().sum()
 }
 
 #[cfg(test)]

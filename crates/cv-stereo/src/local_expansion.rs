@@ -12,8 +12,8 @@ use crate::expansion_region::{Labels, Problem, Region, SMOOTHNESS, Scratch, pixe
 use crate::plane_cost::{Plane, PlaneCost, at};
 use crate::plane_proposals::{MAX_STEP, Pass, Random, cell_and_region, center_of, fit_plane, propose_planes};
 use cv_core::{Cancelled, Progress, Stage};
+use cv_parallel::prelude::*;
 use fearless_simd::Level;
-use rayon::prelude::*;
 
 /// Passes at coarser levels, where large cells have fewer pixels, and at full resolution.
 const COARSE: [Pass; 2] = [Pass { cell: 60, ransac: 3, perturbed: 0 }, Pass { cell: 30, ransac: 2, perturbed: 0 }];
@@ -135,7 +135,7 @@ fn solve(
                     stage.add(cell_units(pass))?;
                     Ok(region)
                 })
-                .collect::<Result<_, Cancelled>>()?;
+                .try_collect::<_, Cancelled>()?;
             for region in regions.into_iter().flatten() {
                 region.write(&mut labels, width);
             }
@@ -195,7 +195,7 @@ fn initial_labels(problem: &Problem<'_>, initial: &[f32], stage: &Stage<'_>) -> 
             }
             Ok(labels)
         })
-        .collect::<Result<_, Cancelled>>()?;
+        .try_collect::<_, Cancelled>()?;
     let mut labels = Labels { planes: vec![[0.0; 3]; width * height], costs: vec![0.0; width * height] };
     for (i, plane, cost) in found.into_iter().flatten() {
         (labels.planes[i], labels.costs[i]) = (plane, cost);

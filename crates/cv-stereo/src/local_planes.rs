@@ -6,7 +6,7 @@
 //! are visible in both images, and the local one for those that are not.
 
 use crate::surfaces::{NONE, Plane, Surfaces, center, neighbors};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Radius of the surroundings in cells, textured and textureless: disparities in low texture have errors that only a large area averages.
 /// (Radii of 1 to 3 and of 6 to 12 differ by up to 0.3 points of the errors above 2 px on 20 public pairs: Middlebury, DrivingStereo, US3D.)

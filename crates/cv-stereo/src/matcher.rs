@@ -23,9 +23,9 @@ use crate::winner::Winner;
 use crate::winner_checks::check_row;
 use crate::{Intensity, IntensityCost, Paths, Search, StereoError, StereoOptions, median, window_sweep};
 use cv_core::{Cancelled, GrayF32, ImageView, Mask, Progress, Stage, StageClock};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch};
 use pyramid::Coarse;
-use rayon::prelude::*;
 use std::ops::Range;
 
 /// An image is not halved below this many px of width or height.

@@ -1,8 +1,8 @@
 //! Median filter of maps with holes.
 
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
-use rayon::prelude::*;
 
 /// Computes the median of the valid values in the window of `radius` (1 or 2) around every valid pixel, the lower one of an even
 /// count; holes stay holes. Windows are cut at the image border.

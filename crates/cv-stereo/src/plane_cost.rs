@@ -7,9 +7,9 @@
 use crate::PixelState;
 use crate::census::{Gray, MARGIN};
 use cv_core::{Cancelled, Stage};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
-use rayon::prelude::*;
 
 /// Sub-pixel positions per pixel at which the right image is described.
 const PHASES: usize = 4;
@@ -118,9 +118,7 @@ impl PlaneCost {
     ) -> Result<Self, Cancelled> {
         let (width, height) = (left.width, left.height);
         // Gray levels of a sensor of few bits are stretched, both images by the same factor.
-        let ends = |row: &[u16]| row.iter().fold((u16::MAX, 0), |(low, high), &v| (low.min(v), high.max(v)));
-        let join = |a: (u16, u16), b: (u16, u16)| (a.0.min(b.0), a.1.max(b.1));
-        let (low, high) = left.values.par_chunks(left.stride()).map(ends).reduce(|| (u16::MAX, 0), join);
+        let (low, high) = left.min_max();
         let span = high.saturating_sub(low);
         let scale = if (1..=u16::MAX / 4).contains(&span) { 255.0 / f32::from(span) } else { 1.0 / 257.0 };
         let float = |gray: &Gray, phase: usize| -> Vec<f32> {

@@ -1,9 +1,9 @@
 //! Search windows from a coarser pyramid level: the range of disparities of each pixel in hierarchical matching (tSGM; Rothermel, Wenzel,
 //! Fritsch & Haala, "SURE: photogrammetric surface reconstruction from imagery", 2012).
 
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
-use rayon::prelude::*;
 
 /// Number of disparities of a window.
 pub(crate) const WINDOW: usize = 32;

@@ -7,7 +7,7 @@
 //! normal exposure, 0.86 % against 0.83, where this filter leaves 0.81; at one stop less 1.28 and 1.23 against 1.37.)
 
 use crate::census::{Gray, MARGIN};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Side of a cell in px, and of the parts of a cell whose means are compared.
 const CELL: usize = 8;

@@ -12,8 +12,8 @@ use crate::kernel::{Output, Sweep, sweep_rows};
 use crate::layout::Layout;
 use crate::winner::Winner;
 use cv_core::{Cancelled, Progress, Stage};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch};
-use rayon::prelude::*;
 use std::ops::Range;
 
 /// Buffers of the aggregation, reused between frames.

@@ -2,7 +2,7 @@
 
 use crate::PixelState;
 use cv_core::UnionFind;
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Rows per strip: strips are labeled in parallel, then merged. Small enough to occupy every core.
 const STRIP: usize = 64;

@@ -11,9 +11,9 @@ use crate::fill_cost::{OCCLUDED_COST, Pair, RightColumns, View, texture_weight, 
 use crate::fill_uncertainty::Extrapolation;
 use crate::surfaces::{CELL, NONE, Surfaces, center, extent, neighbors};
 use cv_core::{Cancelled, Stage};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
-use rayon::prelude::*;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 

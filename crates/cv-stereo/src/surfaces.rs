@@ -3,9 +3,9 @@
 //!
 //! A cell has the moments of its matched pixels, from which planes are fitted, merged and tested without visiting pixels again.
 
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch, prelude::*};
 use fearless_simd_macros::simd;
-use rayon::prelude::*;
 use std::{collections::VecDeque, ops::Range};
 
 /// Side of a cell in px.

@@ -2,8 +2,8 @@
 
 use crate::rng::{Rng, hash2, normal_pair, unit};
 use cv_core::{Camera, DMatch, ModelImage, ModelPoint, Point2, Pose, SparseModel};
+use cv_parallel::prelude::*;
 use nalgebra::{Point3, Vector3};
-use rayon::prelude::*;
 use std::f64::consts::{PI, TAU};
 
 /// Options of [`FeatureViews`].

@@ -7,8 +7,8 @@ use crate::shape::Ray;
 use crate::texture::{Rgb, Texture};
 use crate::world::Hit;
 use cv_core::{Camera, GrayF32, Image, Mask, Point2, Pose, RgbF32, RgbU8};
+use cv_parallel::prelude::*;
 use nalgebra::{Matrix2, Point3, Vector3};
-use rayon::prelude::*;
 
 /// An image with its ground truth: that of the ray through each pixel's center.
 #[derive(Debug, Clone)]
@@ -108,16 +108,14 @@ pub(crate) fn validate(camera: &Camera, pose: &Pose) -> Result<(usize, usize), S
 pub(crate) fn auto_exposure(scene: &Scene) -> f32 {
     let camera = Camera::from_focal(40, 30, 33.0);
     let view = View::new(scene, &camera, &scene.viewpoint());
-    let mut levels: Vec<f32> = (0..40 * 30)
-        .into_par_iter()
-        .filter_map(|i| {
-            let ray = view.ray(Point2::new(f64::from(i % 40), f64::from(i / 40)))?;
-            let is_emitter = |hit: Hit| matches!(scene.world.prims[hit.prim].texture, Texture::Emissive(_));
-            let [r, g, b] =
-                if scene.world.hit(&ray).is_some_and(is_emitter) { return None } else { view.color(&ray, 1.0, None) };
-            Some(0.2126 * r + 0.7152 * g + 0.0722 * b)
-        })
-        .collect();
+    let level = |i: i32| {
+        let ray = view.ray(Point2::new(f64::from(i % 40), f64::from(i / 40)))?;
+        let is_emitter = |hit: Hit| matches!(scene.world.prims[hit.prim].texture, Texture::Emissive(_));
+        let [r, g, b] =
+            if scene.world.hit(&ray).is_some_and(is_emitter) { return None } else { view.color(&ray, 1.0, None) };
+        Some(0.2126 * r + 0.7152 * g + 0.0722 * b)
+    };
+    let mut levels: Vec<f32> = (0..40 * 30).into_par_iter().map(level).collect().into_iter().flatten().collect();
     levels.sort_by(f32::total_cmp);
     let mean = levels.iter().sum::<f32>() / levels.len().max(1) as f32;
     let bright = levels.get(levels.len() * 49 / 50).copied().unwrap_or(0.0);

@@ -2,7 +2,7 @@
 
 use crate::rng::normal_pair;
 use cv_core::{Image, RgbF32, RgbU8};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Imaging parameters. The default is a good compact camera in a well-lit room.
 #[derive(Debug, Clone, PartialEq)]

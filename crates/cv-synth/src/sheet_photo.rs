@@ -8,8 +8,8 @@ use crate::rng::Rng;
 use crate::sensor::{self, RenderOptions};
 use crate::texture::{Rgb, SurfacePoint, Texture, mix, scale};
 use cv_core::{Camera, Distortion, DistortionModel, Point2, Pose, RgbF32, RgbU8};
+use cv_parallel::prelude::*;
 use nalgebra::{Matrix2, Point3, Rotation3, Vector2, Vector3};
-use rayon::prelude::*;
 use std::sync::Arc;
 
 /// A sheet of paper and its illumination. It is in the plane z = 0 of its own frame, from the origin `size` to the

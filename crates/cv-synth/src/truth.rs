@@ -4,8 +4,8 @@ use crate::render::Rendered;
 use crate::scene::Scene;
 use crate::shape::Ray;
 use cv_core::{Camera, Correspondence, Image, Mask, Point2, Pose};
+use cv_parallel::prelude::*;
 use nalgebra::{Matrix3, Point3, Vector3};
-use rayon::prelude::*;
 
 impl Scene {
     /// Returns the world position of the surface at a pixel of a camera.
@@ -52,14 +52,12 @@ impl Scene {
         let (width, height) = a.depth.size();
         let step = step.max(1);
         let rows: Vec<usize> = (step / 2..height).step_by(step).collect();
-        rows.into_par_iter()
-            .flat_map_iter(|y| {
-                (step / 2..width).step_by(step).filter_map(move |x| {
-                    let to = self.transfer(a, b, x, y)?;
-                    Some(Correspondence { a: Point2::new(x as f64, y as f64), b: to })
-                })
-            })
-            .collect()
+        let of_row = |y: usize| -> Vec<Correspondence> {
+            let columns = (step / 2..width).step_by(step);
+            let from = columns.map(|x| (Point2::new(x as f64, y as f64), self.transfer(a, b, x, y)));
+            from.filter_map(|(a, b)| Some(Correspondence { a, b: b? })).collect()
+        };
+        rows.into_par_iter().map(of_row).collect().into_iter().flatten().collect()
     }
 }
 

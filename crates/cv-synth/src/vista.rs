@@ -8,7 +8,7 @@ use crate::rng::{Rng, normal_pair};
 use crate::sensor::encode_srgb;
 use crate::texture::Rgb;
 use cv_core::{Camera, Mask, Point2, RgbU8, Rotation3, Vector3};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// A landscape: sky with a sun, hills, a row of houses, a meadow.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -6,12 +6,12 @@ use crate::checks::Check;
 use anyhow::{Context, Result, ensure};
 use cv_core::{Camera, Distortion, GrayF32, GrayU8, Point2, Pose, Rotation3, Vector3, median};
 use cv_imgproc::{gray_to_f32, resize_area, rgb_to_gray};
+use cv_parallel::prelude::*;
 use cv_pipeline::Silent;
 use cv_pipeline::calibration::{
     BoardSize, CalibrateOptions, LensChoice, TargetCorner, TargetObservations, TargetPoints, calibrate,
 };
 use cv_synth::{ChessboardPhoto, ChessboardTrial, chessboard_photo, photo_without_board};
-use rayon::prelude::*;
 use serde::Deserialize;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -139,7 +139,7 @@ pub(super) fn compare_corners(python: &Path, page: &mut Page) -> Result<()> {
         cv_io::write_png(scratch.path().join(name(trial, seed)), gray.view())?;
         Ok((photo, gray))
     });
-    let photos = photos.collect::<Result<Vec<_>>>()?;
+    let photos = photos.try_collect::<_, anyhow::Error>()?;
     let theirs: Vec<Detection> = run_script(python, &[&"corners", &scratch.path()])?;
     let mut kinds: Vec<Kind> =
         ChessboardTrial::ALL.map(|trial| Kind { trial, detected: [0; 3], errors: Default::default() }).into();
@@ -297,7 +297,7 @@ pub(super) fn compare_without_board(python: &Path, data: &Path, page: &mut Page)
         }
         Ok(out)
     });
-    let crops = crops.collect::<Result<Vec<_>>>()?.concat();
+    let crops = crops.try_collect::<_, anyhow::Error>()?.concat();
     let scratch = tempfile::tempdir()?;
     let kinds = ["scenes, generated", "photograph crops", "facades, generated", "noise and random cells"];
     let image = |kind: usize, i: usize| -> Result<GrayU8> {
@@ -315,7 +315,7 @@ pub(super) fn compare_without_board(python: &Path, data: &Path, page: &mut Page)
             let gray = image(kind, i)?;
             Ok(detect_board(gray_to_f32(gray.view()).view(), BOARD).is_some())
         });
-        false_detections[kind] = is_detected.collect::<Result<Vec<bool>>>()?.into_iter().filter(|d| *d).count();
+        false_detections[kind] = is_detected.try_collect::<_, anyhow::Error>()?.into_iter().filter(|d| *d).count();
         for i in (0..TIMED_IMAGES).map(|i| i * BOARDLESS_IMAGES / TIMED_IMAGES) {
             let gray = image(kind, i)?;
             cv_io::write_png(scratch.path().join(format!("none-{kind}-{i:03}.png")), gray.view())?;

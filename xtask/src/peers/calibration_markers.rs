@@ -7,9 +7,9 @@ use anyhow::{Context, Result, bail};
 use cv_core::{Camera, Distortion, GrayU8, Point2, Pose, Rotation3, Vector3, median};
 use cv_features::{Board, CharucoBoard, ChessboardOptions, Dictionary, GridStyle, MarkerGrid, find_board};
 use cv_imgproc::{gray_to_f32, rgb_to_gray};
+use cv_parallel::prelude::*;
 use cv_pipeline::Silent;
 use cv_synth::{Print, RenderOptions, Sheet, Texture};
-use rayon::prelude::*;
 use serde::Deserialize;
 use std::fmt::Write as _;
 use std::path::Path;
@@ -108,7 +108,7 @@ pub(super) fn run(python: &Path, page: &mut Page) -> Result<()> {
             cv_io::write_png(scratch.path().join(format!("{seed:03}.png")), gray.view())?;
             Ok((gray, truth))
         });
-        let photos = photos.collect::<Result<Vec<_>>>()?;
+        let photos = photos.try_collect::<_, anyhow::Error>()?;
         let kind = board.kind().to_string();
         let [columns, rows, dictionary, last] = parameters;
         let theirs: Vec<Detection> =

@@ -12,7 +12,7 @@ use cv_features::{
     sift,
 };
 use cv_imgproc::{Interpolation, RemapOptions};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 use std::{
     path::{Path, PathBuf},
     process::Command,

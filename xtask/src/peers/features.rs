@@ -10,7 +10,7 @@ use cv_features::{
     ByteDescriptors, CornerMeasure, DescriptorKind, Descriptors, HarrisOptions, MatchOptions, RatioTest, SiftOptions,
     anms, harris, harris_response, match_byte_descriptors, match_descriptors, sift,
 };
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 use serde::Deserialize;
 use std::{
     fmt::Write as _,

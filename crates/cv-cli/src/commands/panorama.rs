@@ -9,6 +9,7 @@ use crate::frame::{Context, Failure, Global, Outcome, Output, Run, Step, expand_
 use crate::{rig, words};
 use cv_core::{Camera, Image, ImageView};
 use cv_io::{DynImage, Metadata, Pixels, PngPixels};
+use cv_parallel::prelude::*;
 use cv_pipeline::panorama_types::{
     BlendMode, CameraMotion, EightBits, Exposure, Framing, PhotoMask, PhotoSample, Projection, Registration, Seams,
 };
@@ -16,7 +17,6 @@ use cv_pipeline::{
     FeatureMethod, FeatureOptions, PanoramaOptions, PanoramaPhoto, PanoramaResult, panorama, panorama_with_masks,
 };
 use masks::MaskFiles;
-use rayon::prelude::*;
 use serde_json::json;
 use std::collections::btree_map::{BTreeMap, Entry};
 use std::path::{Path, PathBuf};
@@ -232,7 +232,7 @@ impl Run for Args {
         if let Some(bytes) = context.max_memory.or_else(|| self.layers.as_ref().map(|_| usize::MAX / 4)) {
             return self.stitch_streamed(&paths, &masks, registration.as_ref(), bytes, context);
         }
-        let pictures = paths.par_iter().map(cv_io::read_image).collect::<Result<Vec<_>, _>>()?;
+        let pictures = paths.par_iter().map(cv_io::read_image).try_collect()?;
         let known: Vec<_> =
             pictures.iter().map(|p| (p.exif.focal.as_ref().map(|focal| focal.pixels), p.metadata.clone())).collect();
         let is_deep = |picture: &DynImage| matches!(picture.pixels, Pixels::Gray16(_) | Pixels::Rgb16(_));

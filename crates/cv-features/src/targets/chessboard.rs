@@ -7,7 +7,7 @@ use super::saddle::refine_saddle;
 use super::x_corner::detect_x_corners;
 use crate::error::check_image;
 use cv_core::{ImageView, OptionError, Point2, Progress, Stage};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Window radius of the corner refinement relative to the distance to the nearest neighbor: small enough to exclude the
 /// neighbor's edges.
@@ -297,7 +297,7 @@ fn localize_corners(
     places: &[Place],
     max_window_radius: f32,
 ) -> Option<Chessboard> {
-    let localized: Option<Vec<_>> = places
+    let localized = places
         .par_iter()
         .with_min_len(16)
         .map(|&(start, spacing)| {
@@ -308,7 +308,7 @@ fn localize_corners(
             is_near.then_some((saddle.position, saddle.deviation_unsmoothed()))
         })
         .collect();
-    let (corners, deviations) = localized?.into_iter().unzip();
+    let (corners, deviations) = localized.into_iter().collect::<Option<Vec<_>>>()?.into_iter().unzip();
     Some(Chessboard { size, corners, deviations })
 }
 

@@ -10,7 +10,7 @@ use super::saddle::refine_saddle;
 use super::x_corner::{XCorner, edge_directions};
 use cv_core::{Cancelled, ImageView, Point2, Stage, Vector2};
 use cv_imgproc::sample_bilinear;
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 use std::collections::{HashMap, VecDeque};
 use std::f64::consts::{PI, TAU};
 
@@ -158,7 +158,7 @@ fn select_neighbors(
             }
             Ok(neighbors_of(i, corners, &axes, &buckets, view, clearance))
         })
-        .collect()
+        .try_collect()
 }
 
 /// Sine of the maximum angle, 23°, between an edge direction and the line to the neighbor. Directions have errors of

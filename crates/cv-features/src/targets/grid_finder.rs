@@ -16,7 +16,7 @@ use crate::error::check_image;
 use crate::simd;
 use cv_core::{GrayF32, ImageView, Matrix3, Point2, Progress, Stage, UnionFind, median};
 use cv_imgproc::decode_srgb;
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// A decoded marker.
 struct DetectedMarker {
@@ -113,7 +113,7 @@ pub fn find_marker_grid(
 /// Converts an sRGB image to linear intensity.
 fn linear_intensity(view: ImageView<'_, f32, 1>) -> GrayF32 {
     let mut out = view.to_image();
-    out.as_mut_slice().par_iter_mut().with_min_len(1 << 14).for_each(|v| *v = decode_srgb(*v));
+    out.as_mut_slice().par_chunks_mut(1 << 14).for_each(|part| part.iter_mut().for_each(|v| *v = decode_srgb(*v)));
     out
 }
 

@@ -7,7 +7,7 @@
 
 use cv_core::{Cancelled, GrayF32, ImageView, Mask, Point2, Stage, Vector2};
 use cv_imgproc::{Connectivity, StructuringElement, connected_components, erode, pyr_down, sample_bilinear};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Maximum number of pixels for the detection of regions; larger images are downsampled, and the sides are then fitted
 /// at full resolution.
@@ -61,7 +61,7 @@ pub(super) fn detect_quads(
             let Some(coarse) = coarse else { return Ok(None) };
             Ok(fit_sides(view, &coarse, 2.5).and_then(|lines| intersect_sides(&lines)))
         })
-        .collect::<Result<_, Cancelled>>()?;
+        .try_collect::<_, Cancelled>()?;
     let mut out: Vec<[Point2<f64>; 4]> = Vec::new();
     for quad in refined.into_iter().flatten() {
         // Most are in both masks.
@@ -134,7 +134,8 @@ fn region_quads(mask: ImageView<'_, bool, 1>) -> Vec<[Point2<f64>; 4]> {
             }
         }
     }
-    ends.into_par_iter().with_min_len(16).filter_map(|ends| simplify_to_quad(convex_hull(&ends))).collect()
+    let quads = ends.into_par_iter().with_min_len(16).map(|ends| simplify_to_quad(convex_hull(&ends))).collect();
+    quads.into_iter().flatten().collect()
 }
 
 /// Returns twice the signed area of a triangle (the orientation predicate).

@@ -10,8 +10,8 @@ use crate::line_buffer::LineBuffer;
 use crate::simd;
 use cv_core::{Cancelled, GrayF32, ImageView, Point2, Progress, Stage};
 use cv_imgproc::{mirror_ends, mirror_index, pyr_down};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch, prelude::*};
-use rayon::prelude::*;
 
 /// The sampling ring: 16 samples, clockwise in the image from the top. The paper's radius is 5; with a pyramid a
 /// smaller one suffices, which fits in small squares.
@@ -137,7 +137,7 @@ fn detect_in_octave(
             }
             Ok(candidates)
         })
-        .collect::<Result<Vec<_>, Cancelled>>()?
+        .try_collect::<_, Cancelled>()?
         .concat();
     if candidates.len() > MAX_CANDIDATES {
         candidates.sort_by(|a, b| b.0.total_cmp(&a.0));

@@ -5,7 +5,7 @@ use crate::epipolar::sampson;
 use crate::essential_from_pose;
 use crate::ransac::{Scorer, TukeyBiweight};
 use cv_core::{Cancelled, Correspondence, Pose, Progress, Stage};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Number of blocks of the first image that are left out in turn.
 const BLOCKS: usize = 8;
@@ -47,7 +47,7 @@ pub fn jackknife_pose_deviation(
             stage.add(1)?;
             Ok(pose_difference(&other, pose).map(|d| d * d))
         })
-        .collect::<Result<_, Cancelled>>()?;
+        .try_collect::<_, Cancelled>()?;
     let factor = (BLOCKS - 1) as f64 / BLOCKS as f64;
     Ok([0, 1].map(|i| (factor * squares.iter().map(|s| s[i]).sum::<f64>()).sqrt()))
 }

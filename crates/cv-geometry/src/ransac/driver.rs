@@ -5,7 +5,7 @@ use super::{
     Consensus, Estimator, LocalOptimization, RansacData, RobustOptions, Sampler, Score, Scorer, TukeyBiweight,
 };
 use cv_core::{Cancelled, Progress, Stage};
-use cv_numeric::parallel_map;
+use cv_parallel::prelude::*;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
@@ -79,13 +79,14 @@ pub(super) fn search<E: Estimator, C: Scorer>(
             None if inner_ransac => f32::INFINITY,
             None => best_minimal_loss,
         };
-        let candidates: Vec<Result<Option<Candidate<E::Model>>, Cancelled>> =
-            if n < MIN_PARALLEL_DATA && count < MAX_BATCH {
-                samples.chunks(CHUNK).map(|chunk| best_of_samples(quality, chunk, limit, &mut models, &stage)).collect()
-            } else {
-                let chunks: Vec<&[[u32; 8]]> = samples.chunks(CHUNK).collect();
-                parallel_map(chunks.len(), &|i| best_of_samples(quality, chunks[i], limit, &mut Vec::new(), &stage))
-            };
+        let candidates: Vec<Result<Option<Candidate<E::Model>>, Cancelled>> = if n < MIN_PARALLEL_DATA
+            && count < MAX_BATCH
+        {
+            samples.chunks(CHUNK).map(|chunk| best_of_samples(quality, chunk, limit, &mut models, &stage)).collect()
+        } else {
+            let chunks = samples.par_chunks(CHUNK);
+            chunks.map_init(Vec::new, |models, chunk| best_of_samples(quality, chunk, limit, models, &stage)).collect()
+        };
         for candidate in candidates {
             let Some(candidate) = candidate? else { continue };
             if candidate.scored.score.loss >= best_minimal_loss {
@@ -118,7 +119,7 @@ pub(super) fn search<E: Estimator, C: Scorer>(
             stage.add(1)?;
             Ok(optimized)
         };
-        for optimized in parallel_map(runners_up.len(), &optimize) {
+        for optimized in (0..runners_up.len()).into_par_iter().map(optimize).collect() {
             let optimized: ScoredModel<E::Model> = optimized?;
             if optimized.score.loss < best.score.loss {
                 best = optimized;

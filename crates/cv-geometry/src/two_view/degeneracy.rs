@@ -7,7 +7,7 @@ use crate::{
     normalize_matches,
 };
 use cv_core::{Camera, Cancelled, Correspondence, Distortion, Matrix3, Pose, Progress, Vector3};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Numbers of inliers of a homography and of a rotation.
 pub(super) struct DegeneracyTest {
@@ -61,7 +61,7 @@ impl DegeneracyTest {
             _ => {
                 let search_distortion = |distortion: &f64| search.search(Some(*distortion), progress);
                 let all: Vec<Option<PlaneHypothesis>> =
-                    DISTORTION_GRID.par_iter().map(search_distortion).collect::<Result<_, _>>()?;
+                    DISTORTION_GRID.par_iter().map(search_distortion).try_collect()?;
                 match all.into_iter().flatten().min_by(|a, b| a.loss.total_cmp(&b.loss)) {
                     Some(best) => Some(search.refine_distortion(best, progress)?),
                     None => None,

@@ -8,7 +8,7 @@ use crate::{
     poses_are_indistinguishable, refine_relative_pose,
 };
 use cv_core::{Camera, Correspondence, Distortion, Pose, Progress, Stage};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Cameras, relative pose and inliers of two views, before bundle adjustment
 /// ([`TwoViewAdjustment`](super::TwoViewAdjustment)).
@@ -166,18 +166,18 @@ fn estimate_calibrated(
     let usable: Vec<usize> = (0..normalized.len()).filter(|&i| normalized[i].is_finite()).collect();
     let normalized: Vec<_> = usable.iter().map(|&i| normalized[i]).collect();
     let threshold = options.robust.threshold * unit;
-    let stage = Stage::new(progress, "pose", SEARCHES as usize)?;
-    let search = |k: u64| {
-        let seed = options.robust.seed.wrapping_add(k);
+    let stage = Stage::new(progress, "pose", SEARCHES)?;
+    let search = |k: usize| {
+        let seed = options.robust.seed.wrapping_add(k as u64);
         let options = RobustOptions { threshold, seed, ..options.robust };
         let estimate = estimate_relative_pose(&normalized, &options, &stage)?;
         let (pose, loss) = refine_relative_pose(&estimate.model, &normalized, threshold);
         stage.add(1)?;
         Ok((RobustModel { model: pose, ..estimate }, loss))
     };
-    let searches: Vec<_> = (0..SEARCHES).into_par_iter().map(search).collect();
+    let searches = (0..SEARCHES).into_par_iter().map(search).try_collect();
     let mut estimates: Vec<(RobustModel<Pose>, f64)> =
-        searches.into_iter().collect::<Result<_, _>>().map_err(|error| two_view_error(error, pairs.len(), options))?;
+        searches.map_err(|error| two_view_error(error, pairs.len(), options))?;
     estimates.sort_by(|a, b| a.1.total_cmp(&b.1));
     let (best, others) = (&estimates[0].0, &estimates[1..]);
     check_inliers(best.inliers.len(), pairs.len(), options)?;
@@ -201,7 +201,7 @@ fn estimate_calibrated(
 
 /// Number of searches with different seeds. If the matches determine the pose, all find it. Of two equally likely
 /// poses, five searches miss one with a probability of 1/16.
-const SEARCHES: u64 = 5;
+const SEARCHES: usize = 5;
 
 /// Converts an estimation error: no consensus becomes too few inliers.
 fn two_view_error(error: EstimateError, matches: usize, options: &TwoViewOptions) -> TwoViewError {

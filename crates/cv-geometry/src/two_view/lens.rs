@@ -6,7 +6,7 @@ use crate::{
     estimate_shared_focal_pose, normalize_matches, refine_relative_pose, refine_shared_focal_pose, sampson,
 };
 use cv_core::{Camera, Cancelled, Correspondence, Distortion, Matrix3, Pose, Progress, Stage};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Focal lengths in pixels, and the radial distortion as the relative displacement of the image corners.
 #[derive(Clone, Copy)]
@@ -84,8 +84,7 @@ pub(super) fn find_lens(
         stage.add(1)?;
         Ok(hypothesis)
     };
-    let hypotheses: Vec<Option<LensHypothesis>> =
-        DISTORTION_GRID.par_iter().map(search_distortion).collect::<Result<_, _>>()?;
+    let hypotheses: Vec<Option<LensHypothesis>> = DISTORTION_GRID.par_iter().map(search_distortion).try_collect()?;
     let mut hypotheses: Vec<LensHypothesis> = hypotheses.into_iter().flatten().collect();
     let mut best = match min_loss(&hypotheses) {
         Some(first) => {
@@ -221,7 +220,7 @@ impl Search<'_> {
     fn search_focal_grid(&self) -> Result<Option<LensHypothesis>, Cancelled> {
         let side = longer_side(&self.base[0]) as f64;
         let search = |ratio: &f64| self.search_pose(Lens { focal: [ratio * side; 2], distortion: 0.0 });
-        let hypotheses: Vec<Option<LensHypothesis>> = FOCAL_GRID.par_iter().map(search).collect::<Result<_, _>>()?;
+        let hypotheses: Vec<Option<LensHypothesis>> = FOCAL_GRID.par_iter().map(search).try_collect()?;
         let hypotheses: Vec<LensHypothesis> = hypotheses.into_iter().flatten().collect();
         min_loss(&hypotheses).map(|best| self.refine_distortion(best, false)).transpose()
     }

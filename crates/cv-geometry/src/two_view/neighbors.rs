@@ -2,7 +2,7 @@
 
 use crate::{normalize_matches, triangulate};
 use cv_core::{Camera, Cancelled, Correspondence, Point3, Pose, Progress, Stage};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Number of nearest neighbors in the first image.
 const NEIGHBORS: usize = 8;
@@ -52,7 +52,7 @@ pub(super) fn depth_consistent_matches(
         stage.add(1)?;
         Ok(is_consistent(pair))
     };
-    let consistent: Vec<bool> = guided.par_iter().zip(&normalized).map(test).collect::<Result<_, Cancelled>>()?;
+    let consistent: Vec<bool> = guided.par_iter().zip(&normalized).map(test).try_collect::<_, Cancelled>()?;
     Ok((0..guided.len()).filter(|&i| consistent[i]).collect())
 }
 

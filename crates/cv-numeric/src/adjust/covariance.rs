@@ -6,8 +6,8 @@ use super::normal::{Normal, Reduced, is_determined};
 use super::residual::LossModel;
 use super::structure::{NONE, Structure};
 use super::{Adjustment, GroupId};
+use cv_parallel::prelude::*;
 use nalgebra::{DMatrix, DVector};
-use rayon::prelude::*;
 
 /// Relative eigenvalue of the reduced system, scaled by its diagonal, below which it counts as singular: elimination cancels to about 1e-14.
 const EIGENVALUE_TOLERANCE: f64 = 1e-12;

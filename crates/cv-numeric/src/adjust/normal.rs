@@ -4,8 +4,8 @@ use super::product::{multiply_inverse, subtract_product};
 use super::residual::{ColumnSums, LossModel, PointSums, ResidualKind, Values, WeightedRows};
 use super::structure::{MAX_BLOCK_COLUMNS, Points, Structure};
 use crate::linear::cholesky_lower;
+use cv_parallel::prelude::*;
 use nalgebra::{Cholesky, DMatrix, SMatrix};
-use rayon::prelude::*;
 use std::ops::Range;
 
 /// Ridge on the diagonal of an eliminated block, relative to its trace: points near infinity have almost no depth information.
@@ -151,10 +151,13 @@ impl Normal {
         reduced: &mut Reduced,
     ) -> Result<(), usize> {
         resize_zeroed(&mut reduced.inverses, points.count * E * E);
-        let parts = reduced.inverses.par_chunks_mut(E * E).zip(self.v.par_chunks(E * E)).enumerate().with_min_len(256);
-        let failed =
-            parts.filter_map(|(r, (out, v))| invert_damped::<E>(v, damping, out).err().map(|()| points.order[r]));
-        if let Some(p) = failed.min() {
+        let size = POINTS_PER_TASK * E * E;
+        let parts = reduced.inverses.par_chunks_mut(size).zip(self.v.par_chunks(size));
+        let first_failed = parts.zip(points.order.par_chunks(POINTS_PER_TASK)).map(|((out, v), order)| {
+            let blocks = out.chunks_exact_mut(E * E).zip(v.chunks_exact(E * E)).zip(order);
+            blocks.filter_map(|((out, v), p)| invert_damped::<E>(v, damping, out).err().map(|()| *p)).min()
+        });
+        if let Some(p) = first_failed.collect().into_iter().flatten().min() {
             return Err(p as usize);
         }
         let inverses = &reduced.inverses;
@@ -211,7 +214,7 @@ impl Normal {
         let Some(points) = &structure.points else { return Vec::new() };
         let e = points.size;
         let mut by_rank = vec![0.0; points.count * e];
-        by_rank.par_chunks_mut(e).enumerate().with_min_len(256).for_each(|(r, out)| {
+        let step_of = |r: usize, out: &mut [f64]| {
             let (inverse, w) = self.inverse_and_cross_terms(points, reduced, r);
             let mut sum = [0.0; 6];
             sum[..e].copy_from_slice(&self.point_gradient[r * e..][..e]);
@@ -226,6 +229,9 @@ impl Normal {
             for (out, inverse) in out.iter_mut().zip(inverse.chunks_exact(e)) {
                 *out = -inverse.iter().zip(&sum).map(|(v, s)| v * s).sum::<f64>();
             }
+        };
+        by_rank.par_chunks_mut(POINTS_PER_TASK * e).enumerate().for_each(|(part, out)| {
+            (part * POINTS_PER_TASK..).zip(out.chunks_exact_mut(e)).for_each(|(r, out)| step_of(r, out));
         });
         by_rank
     }
@@ -271,15 +277,15 @@ fn resize_zeroed(values: &mut Vec<f64>, n: usize) {
     values.resize(n, 0.0);
 }
 
-/// Splits a slice at ascending positions, for parallel iteration.
-fn split_at_starts<'a>(mut values: &'a mut [f64], start: &[usize]) -> rayon::vec::IntoIter<&'a mut [f64]> {
+/// Splits a slice at ascending positions.
+fn split_at_starts<'a>(mut values: &'a mut [f64], start: &[usize]) -> Vec<&'a mut [f64]> {
     let mut parts = Vec::with_capacity(start.len().saturating_sub(1));
     for pair in start.windows(2) {
         let (part, rest) = values.split_at_mut(pair[1] - pair[0]);
         parts.push(part);
         values = rest;
     }
-    parts.into_par_iter()
+    parts
 }
 
 /// Calls `of` in parallel for each of [`Structure::tasks`] with its index, its blocks, and their parts of the values of
@@ -294,6 +300,6 @@ fn for_each_task(
     let column = |b: &usize| structure.blocks.get(*b).map_or(structure.columns, |b| b.column);
     let starts: Vec<usize> = tasks.iter().map(|b| structure.pattern.start[*b]).collect();
     let columns: Vec<usize> = tasks.iter().map(column).collect();
-    let parts = split_at_starts(values, &starts).zip(split_at_starts(vector, &columns)).enumerate();
-    parts.for_each(|(t, (values, vector))| of(t, tasks[t]..tasks[t + 1], values, vector));
+    let parts = split_at_starts(values, &starts).into_par_iter().zip(split_at_starts(vector, &columns));
+    parts.enumerate().for_each(|(t, (values, vector))| of(t, tasks[t]..tasks[t + 1], values, vector));
 }

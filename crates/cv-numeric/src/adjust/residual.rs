@@ -4,9 +4,8 @@ use super::manifold::Manifold;
 use super::product::{add_gradient, add_product};
 use super::structure::{Incidence, NONE, Structure};
 use crate::RobustLoss;
-use crate::parallel_map;
+use cv_parallel::prelude::*;
 use nalgebra::{SMatrix, SVector};
-use rayon::prelude::*;
 use std::ops::Range;
 
 /// Residuals of one kind: `R` components for each item, which depend on `B` parameter blocks (1 to 4) with `C` degrees of freedom
@@ -319,7 +318,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Resid
         let chunks = self.len().div_ceil(ITEMS_PER_CHUNK);
         let of =
             |c: usize| self.cost_of_range(values, c * ITEMS_PER_CHUNK..((c + 1) * ITEMS_PER_CHUNK).min(self.len()));
-        parallel_map(chunks, &of).iter().sum()
+        (0..chunks).into_par_iter().map(of).collect().iter().sum()
     }
 
     fn linearize(
@@ -336,8 +335,8 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Resid
             .par_chunks_mut(ITEMS_PER_CHUNK * R * C)
             .zip(rows.residuals.par_chunks_mut(ITEMS_PER_CHUNK * R));
         let chunks = chunks.zip(incidence.items.par_chunks(ITEMS_PER_CHUNK));
-        let failed = chunks.filter_map(|(out, items)| self.linearize_chunk(values, incidence, model, items, out).err());
-        failed.min().map_or(Ok(()), Err)
+        let failed = chunks.map(|(out, items)| self.linearize_chunk(values, incidence, model, items, out).err());
+        failed.collect().into_iter().flatten().min().map_or(Ok(()), Err)
     }
 
     fn sums(&self, values: &Values) -> Result<ResidualSums, usize> {
@@ -349,7 +348,7 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Resid
             }
             Ok(sums)
         };
-        sum_in_order(parallel_map(self.len().div_ceil(ITEMS_PER_CHUNK), &chunk))
+        sum_in_order((0..self.len().div_ceil(ITEMS_PER_CHUNK)).into_par_iter().map(chunk).collect())
     }
 
     #[cfg(test)]

@@ -7,9 +7,9 @@ use crate::align::{AlignError, AlignOptions, Alignment, Photo, View, align};
 use cv_core::{Cancelled, Correspondence, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
 use cv_geometry::VerifiedPair;
 use cv_imgproc::{SAMPLE_LANES, bicubic_lanes};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch};
 use nalgebra::{SMatrix, SVector};
-use rayon::prelude::*;
 use std::collections::HashSet;
 
 /// Patch radius in pixels.
@@ -77,7 +77,7 @@ pub fn refine_alignment(
             let are_enough = matches.len() >= MIN_MATCHES;
             Ok(if are_enough { with_matches(pair, matches) } else { (*pair).clone() })
         })
-        .collect::<Result<_, Cancelled>>()?;
+        .try_collect::<_, Cancelled>()?;
     // Without parallax, residuals are those of the registration, and a narrow loss rejects what moved.
     let has_parallax = alignment.median_px > MAX_MEDIAN_RATIO * options.outlier_px;
     let outlier_px = options.outlier_px * if has_parallax { 1.0 } else { NARROW_LOSS_RATIO };
@@ -100,7 +100,7 @@ pub fn refine_alignment(
                     let are_more = matches.len() > pair.matches.len();
                     Ok(if are_more { with_matches(pair, matches) } else { pair.clone() })
                 })
-                .collect::<Result<_, Cancelled>>()?;
+                .try_collect::<_, Cancelled>()?;
             let scale = (LOSS_PER_MEDIAN * found.median_px).clamp(MIN_LOSS_PX, options.outlier_px);
             solve(&found, &dense, &AlignOptions { outlier_px: scale, ..options })
         }

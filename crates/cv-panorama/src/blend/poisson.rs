@@ -10,7 +10,7 @@ use crate::blend::hard_seams::copy;
 use crate::blend::{Blender, Composition, NO_PHOTO};
 use crate::rows::{for_each_row_with, is_check_due};
 use cv_core::{Cancelled, Image, Progress, Stage};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Weight λ of the screening term, which pulls the correction toward zero: it decays over 1/√λ = 1000 pixels, which limits drift in long panoramas.
 const SCREEN: f32 = 1e-6;

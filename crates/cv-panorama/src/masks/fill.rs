@@ -6,7 +6,7 @@ use crate::bit_depth::{Channel, PhotoSample};
 use crate::rows::{for_each_row, is_check_due};
 use crate::stream::PhotoSource;
 use cv_core::{Cancelled, Image, ImageView, Progress, Silent, Stage};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 use std::borrow::Cow;
 
 /// Pixels around the removed ones from which colors are taken.
@@ -83,7 +83,7 @@ pub(crate) fn filled<T: PhotoSample>(
         let Some(mask) = mask else { return Ok(None) };
         mask.filled(*photo, &Stage::new(progress, "elastic", 1)?)
     });
-    masked.collect()
+    masked.try_collect()
 }
 
 /// Photographs without the colors of their removed pixels.

@@ -6,7 +6,7 @@ use crate::regions::Region;
 use crate::rows::for_each_row;
 use crate::surface::{Bounds, DisplacementField, Layout, Map, Placement, Preview, PreviewScale, Surface, WarpedPhoto};
 use cv_core::{Cancelled, Image, Point2, Progress, Scaling, Stage, Vector2};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// The masks of the placements of a layout.
 pub(crate) struct PlacedMasks<'a> {
@@ -61,7 +61,7 @@ impl<'a> PlacedMasks<'a> {
             })?;
             Ok(Some(flags))
         };
-        Ok(PreviewMasks(self.masks.par_iter().enumerate().map(flags).collect::<Result<_, _>>()?))
+        Ok(PreviewMasks(self.masks.par_iter().enumerate().map(flags).try_collect()?))
     }
 
     /// Clears the opacity of placement `k`, warped to a part of the canvas in full resolution, where its mask removes it and where another that has a region is

@@ -15,7 +15,7 @@
 use crate::photometric::{Exposure, ExposureCorrection, Gains, SATURATED_LEVEL};
 use crate::surface::{Layout, Piece, Preview};
 use cv_core::{Cancelled, Progress, Scaling, Stage, luma_f32};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Ranges of exposure, in stops, up to which the lift is 0 and from which on it is full: half a stop is the usual scatter of automatic exposure, which nobody sees as too dark; 1.5 stops exceed the
 /// range of a photograph's midtones.
@@ -269,7 +269,7 @@ impl Windows {
                 running_sums(&mut column, radius, false);
                 Ok(column)
             })
-            .collect::<Result<_, _>>()?;
+            .try_collect()?;
         rows.par_chunks_mut(width.max(1)).enumerate().for_each(|(y, row)| {
             row.iter_mut().zip(&columns).for_each(|(sum, column)| *sum = column[y]);
         });

@@ -5,7 +5,7 @@ use crate::photometric::Gains;
 use crate::rows::{for_each_row, is_check_due};
 use crate::surface::{CLIPPED, WarpedPhoto};
 use cv_core::{Cancelled, Image, ImageView, RgbF32, Stage};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Minimum radiance of a replacement relative to the clipped value, which is a lower bound: darker samples show something else.
 const MIN_REPLACEMENT_RATIO: f32 = 0.8;
@@ -61,7 +61,7 @@ pub(crate) fn fill_saturated(photos: &mut [Option<WarpedPhoto<f32>>], stage: &St
         Ok(pixels)
     };
     let filled: Vec<_> =
-        photos.par_iter().map(|photo| photo.as_ref().map(fill).transpose()).collect::<Result<_, Cancelled>>()?;
+        photos.par_iter().map(|photo| photo.as_ref().map(fill).transpose()).try_collect::<_, Cancelled>()?;
     for (photo, filled) in photos.iter_mut().flatten().zip(filled.into_iter().flatten()) {
         photo.pixels = filled;
     }

@@ -5,7 +5,7 @@ use crate::rows::{for_each_row, is_check_due};
 use crate::surface::{Bounds, WarpedPhoto};
 use cv_core::{Cancelled, Image, Stage};
 use cv_imgproc::GridCut;
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Smoothness cost per unit of seam length.
 const LENGTH_COST: i32 = 4 * 3;
@@ -49,7 +49,7 @@ where
                     group.iter().copied().filter(|&k| std::mem::replace(&mut stale[k], false)).collect();
                 let snapshot = &*labels;
                 let changes: Vec<Vec<usize>> =
-                    turn.par_iter().map(|&alpha| self.expand_one(snapshot, alpha, stage)).collect::<Result<_, _>>()?;
+                    turn.par_iter().map(|&alpha| self.expand_one(snapshot, alpha, stage)).try_collect()?;
                 for (&alpha, changed) in turn.iter().zip(&changes).filter(|(_, changed)| !changed.is_empty()) {
                     changed.iter().for_each(|&i| labels.as_mut_slice()[i] = alpha as u16);
                     for (other, s) in stale.iter_mut().enumerate() {

@@ -3,7 +3,7 @@
 
 use crate::surface::{PAD, Piece, Preview, SEARCH_RADIUS, SEARCH_SIDE, Template};
 use cv_core::{Cancelled, GrayF32, Stage, luma_f32};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Patch radius in preview pixels.
 const PATCH_RADIUS: usize = 4;
@@ -41,7 +41,7 @@ impl Misalignments {
                 let (a, b) = (k / n, k % n);
                 if a < b && photo_of[a] != photo_of[b] { compare(preview, &lumas, a, b, stage) } else { Ok(None) }
             })
-            .collect::<Result<_, _>>()?;
+            .try_collect()?;
         Ok(Self { pieces: n, pairs })
     }
 

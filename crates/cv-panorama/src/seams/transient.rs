@@ -1,7 +1,7 @@
 //! Data term against transient objects: where three or more photographs cover a pixel, the deviation of each from their median.
 
 use crate::surface::{Piece, Preview};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Photographs of a pixel from which on their median is that of the scene.
 const MIN_PHOTOS: usize = 3;

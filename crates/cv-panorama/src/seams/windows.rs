@@ -9,7 +9,7 @@ use crate::render::RenderError;
 use crate::stream::{LabelRows, WarpedStore};
 use crate::surface::{Bounds, WarpedPhoto};
 use cv_core::{Image, Progress, Stage};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 use std::collections::BTreeSet;
 
 /// Canvas pixels that an expansion reads around the bounds of a photograph: the next pixel, and that before it for gradients.
@@ -67,7 +67,7 @@ pub(crate) fn refine_in_windows<T: Internals>(
                     .map(|i| (window.left + i % names.width(), window.top + i / names.width()))
                     .collect())
             };
-            let changes: Vec<Vec<(usize, usize)>> = batch.par_iter().map(expand).collect::<Result<_, _>>()?;
+            let changes: Vec<Vec<(usize, usize)>> = batch.par_iter().map(expand).try_collect()?;
             for (&alpha, changed) in batch.iter().zip(changes) {
                 relabel(labels, alpha as u16, &changed);
             }
@@ -182,7 +182,7 @@ fn refine_blocks<T: Internals>(
                 let global = |i: usize| (blocks.top + i / blocks.width()) * across + blocks.left + i % blocks.width();
                 Ok(changed.into_iter().map(global).collect())
             };
-            let changes: Vec<Vec<usize>> = batch.par_iter().map(expand).collect::<Result<_, _>>()?;
+            let changes: Vec<Vec<usize>> = batch.par_iter().map(expand).try_collect()?;
             for (&alpha, changed) in batch.iter().zip(&changes) {
                 changed.iter().for_each(|&i| after.as_mut_slice()[i] = alpha as u16);
             }

@@ -28,7 +28,7 @@ use crate::surface::{
 use blend::Tiling;
 use budget::{Budget, needs_whole};
 use cv_core::{Image, ImageView, Mask, Progress, RgbU8, Stage, StageClock};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 use scratch::{GrayStore, Scratch};
 use std::borrow::Cow;
 use std::io::{Read, Seek, Write};
@@ -447,7 +447,7 @@ fn loaded<T: PhotoSample>(
     let indices: Vec<usize> = (0..count).collect();
     let mut all = (Vec::with_capacity(count), Vec::with_capacity(count));
     for batch in indices.chunks(loads) {
-        let entries: Vec<Entry> = batch.par_iter().map(|&index| one(index)).collect::<Result<_, RenderError>>()?;
+        let entries: Vec<Entry> = batch.par_iter().map(|&index| one(index)).try_collect::<_, RenderError>()?;
         all.extend(entries);
     }
     Ok(all)

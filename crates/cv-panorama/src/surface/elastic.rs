@@ -10,8 +10,8 @@ use crate::surface::structure_tensor::StructureTensor;
 use crate::surface::{DisplacementField, Layout, PAD, Placement, SEARCH_RADIUS, SEARCH_SIDE, Surface, Template};
 use cv_core::{Cancelled, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
 use cv_imgproc::{SAMPLE_LANES, bilinear_lanes};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch};
-use rayon::prelude::*;
 use std::ops::Deref;
 
 /// A correspondence of two placements, in canvas pixels before displacement.
@@ -60,7 +60,7 @@ pub(crate) fn displacements(
         let gray = cv_imgproc::rgb_to_gray(*p);
         stage.add(1).map(|()| gray)
     };
-    let grays: Vec<GrayU8> = photos.par_iter().map(gray).collect::<Result<_, _>>()?;
+    let grays: Vec<GrayU8> = photos.par_iter().map(gray).try_collect()?;
     displacements_with(&|photo| Ok::<_, Cancelled>(&grays[photo]), masks, layout, alignment, &stage)
 }
 
@@ -336,7 +336,8 @@ where
     G: Deref<Target = GrayU8> + Sync,
     E: From<Cancelled> + Send,
 {
-    sites.par_chunk_by_mut(|a, b| (a.p, a.q) == (b.p, b.q)).try_for_each(|overlap| {
+    let overlaps: Vec<&mut [PatchSite]> = sites.chunk_by_mut(|a, b| (a.p, a.q) == (b.p, b.q)).collect();
+    overlaps.into_par_iter().try_for_each(|overlap| {
         let Some(site) = overlap.first() else { return Ok(()) };
         let photo = |k: usize| gray(layout.placements[k].photo);
         let (first, second) = (photo(site.p)?, photo(site.q)?);

@@ -6,8 +6,8 @@ use crate::rows::is_check_due;
 use crate::surface::{Bounds, DisplacementField, Layout, Map, Placement, Surface, WarpSettings, WarpedPhoto, warp};
 use cv_core::{Cancelled, Image, ImageView, Progress, RgbU8, Scaling, Stage, luma_f32};
 use cv_imgproc::{Interpolation, Pixel};
+use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch};
-use rayon::prelude::*;
 
 /// All placements warped at `1 / step` of the canvas resolution.
 pub(crate) struct Preview {
@@ -162,7 +162,7 @@ impl Preview {
             stage.add(1)?;
             Ok(small)
         };
-        let small: Vec<Option<RgbU8>> = photos.par_iter().enumerate().map(small).collect::<Result<_, Cancelled>>()?;
+        let small: Vec<Option<RgbU8>> = photos.par_iter().enumerate().map(small).try_collect::<_, Cancelled>()?;
         Self::draw_small(&small, layout, fields, scale, &stage)
     }
 
@@ -204,7 +204,7 @@ impl Preview {
             Ok(Some(Piece::new(warped, eccentricity, radius, mean_level)))
         };
         let pieces: Vec<Option<Piece>> =
-            layout.placements.par_iter().enumerate().map(draw).collect::<Result<_, Cancelled>>()?;
+            layout.placements.par_iter().enumerate().map(draw).try_collect::<_, Cancelled>()?;
         Ok(Self { step, width, height, pieces: pieces.into_iter().flatten().collect() })
     }
 

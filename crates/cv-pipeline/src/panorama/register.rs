@@ -16,7 +16,7 @@ use cv_panorama::{
     AlignError, Alignment, PairRejection, Photo, PhotoMask, Unplaced, VerifiedPair, align, refine_alignment,
     verify_pair,
 };
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Result of registration.
 pub(super) struct Registered {
@@ -42,7 +42,7 @@ pub(super) fn register(
         let resize = |p: &PanoramaPhoto<'_>| Prepared::new(p, &options.matching, options.registration_pixels, &stage);
         for batch in indices.chunks(photos.at_once()) {
             let batch = batch.par_iter().map(|index| photos.prepare(*index, &resize));
-            prepared.extend(batch.collect::<Result<Vec<_>, _>>()?);
+            prepared.extend(batch.try_collect()?);
         }
     }
     let extract = |prepared: &mut [Prepared], matching: &MatchingOptions, pixels: usize| -> Result<(), Cancelled> {
@@ -313,7 +313,7 @@ fn match_pairs(
         stage.add(1)?;
         Ok(pair)
     };
-    let matched = pairs.par_iter().map(compare).collect::<Result<Vec<_>, Cancelled>>()?;
+    let matched = pairs.par_iter().map(compare).try_collect::<_, Cancelled>()?;
     Ok(matched.into_iter().flatten().collect())
 }
 

@@ -9,7 +9,7 @@ use cv_panorama::{
     EightBits, Layer, MemoryLimit, NO_PHOTO, NotWritten, PhotoMask, PhotoSample, PhotoSource, Registration,
     RenderError, RowSink, StreamError, StreamedFrame, check_masks, render_streamed,
 };
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 use std::borrow::Cow;
 
 /// Prior knowledge of the camera of a photograph.
@@ -83,7 +83,7 @@ fn order<T: PhotoSample>(
             stage.add(1)?;
             Ok((sizes[index], hash))
         };
-        sparse.extend(batch.par_iter().map(hash).collect::<Result<Vec<_>, _>>()?);
+        sparse.extend(batch.par_iter().map(hash).try_collect()?);
     }
     // One that cannot be read again is reported by the next that loads it.
     Ok(Order::by(&sparse, |index| load(photos, index).map_or([0; 2], |photo| whole_hashes(&photo.view()))))

@@ -2,7 +2,7 @@
 
 use super::dense::DensePhoto;
 use cv_core::{Camera, Cancelled, GrayF32, Point2, Point3, PointCloud, Pose, Progress, Stage, Vector3};
-use rayon::prelude::*;
+use cv_parallel::prelude::*;
 
 /// Depth at a pixel.
 #[derive(Clone, Copy)]
@@ -132,7 +132,7 @@ pub(super) fn fuse(
                 stage.check()?;
                 Ok((y * width..(y + 1) * width).filter_map(point).collect())
             })
-            .collect::<Result<_, Cancelled>>()?;
+            .try_collect::<_, Cancelled>()?;
         for point in rows.into_iter().flatten() {
             cloud.positions.push(point.position);
             cloud.colors.push(point.color);

@@ -9,8 +9,8 @@ use cv_features::{
     ByteDescriptors, MatchError, MatchOptions, TwoViewModel, largest_keypoints, match_byte_descriptors,
     match_guided_bytes,
 };
+use cv_parallel::prelude::*;
 use cv_sfm::{CameraKnowledge, PairMatches, ViewPair, ViewPairError, ViewPairModel, verify_view_pair};
-use rayon::prelude::*;
 
 /// A photograph prepared for matching.
 struct PreparedPhoto<'p> {
@@ -56,18 +56,19 @@ pub fn sfm_pairs(
         .map(|photo| Some(PreparedPhoto::new(photo, cameras.get(photo.camera)?, options.first_features)))
         .collect();
     let stage = Stage::new(progress, "match", candidates.len())?;
-    let mut states: Vec<PairState<'_>> = candidates
-        .par_iter()
+    let pair_of = |&(a, b): &(usize, usize)| {
+        Some(Pair { views: [a, b], sides: [prepared[a].as_ref()?, prepared[b].as_ref()?], options })
+    };
+    let pairs: Vec<Pair<'_>> = candidates.iter().filter_map(pair_of).collect();
+    let mut states: Vec<PairState<'_>> = pairs
+        .into_par_iter()
         .with_max_len(1)
-        .filter_map(|&(a, b)| {
-            Some(Pair { views: [a, b], sides: [prepared[a].as_ref()?, prepared[b].as_ref()?], options })
-        })
         .map(|pair| {
             let state = pair.with_coarse_features(&stage)?;
             stage.add(1)?;
             Ok(state)
         })
-        .collect::<Result<_, Cancelled>>()?;
+        .try_collect::<_, Cancelled>()?;
     let needs_all_features =
         |t: &PairState<'_>| !t.is_firm() && !t.has_all_features && t.tentative >= options.pairs.min_inliers;
     let selected = best_of_each(&states, photos.len(), options.firm_partners, needs_all_features);
@@ -120,7 +121,7 @@ fn process_selected<'p>(
         stage.add(1)?;
         Ok(processed)
     };
-    states.into_par_iter().zip(selected).with_max_len(1).map(one).collect()
+    states.into_par_iter().zip(selected).with_max_len(1).map(one).try_collect()
 }
 
 /// Minimum inlier ratio of a firm pair, whose geometry is reliable enough for guided matching (Brown and Lowe's test):

@@ -4,12 +4,12 @@
 
 use cv_core::{Correspondence, DMatch, Keypoint, Pose, Rotation3, Silent, Vector3};
 use cv_geometry::{essential_from_pose, sampson};
+use cv_parallel::prelude::*;
 use cv_sfm::{
     CameraKnowledge, PairMatches, PairRefusal, SfmInput, SfmOptions, SfmOutcome, SfmView, Solver, ViewPairModel,
     ViewPairOptions, reconstruct_views, verify_view_pair,
 };
 use cv_synth::{FeatureViews, FeatureViewsOptions};
-use rayon::prelude::*;
 
 /// A walk of 50 views along a street of two to eight identical houses; a quarter of the points of each are its own.
 fn street(seed: u64) -> FeatureViews {
@@ -130,6 +130,7 @@ const STREETS: std::ops::Range<u64> = 0..20;
 #[test]
 fn twenty_streets_of_identical_houses_are_not_collapsed() {
     let rows: Vec<(u64, Dataset, SfmOutcome)> = STREETS
+        .collect::<Vec<_>>()
         .into_par_iter()
         .map(|seed| {
             let dataset = Dataset::new(seed, if seed % 5 == 0 { Dataset::verified } else { Dataset::ideal });

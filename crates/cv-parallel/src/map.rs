@@ -1,0 +1,77 @@
+//! Results of the items of a parallel iterator, in their order.
+
+use crate::ParallelIterator;
+use crate::batches::lock;
+use crate::parallel_iterator::FirstError;
+use std::sync::{Mutex, PoisonError};
+
+/// Items and what is computed of each, in parallel, when the results are collected. Made by [`ParallelIterator::map`].
+#[must_use = "nothing is done until the results are collected"]
+pub struct ParallelMap<I, N, F> {
+    pub(crate) items: ParallelIterator<I>,
+    pub(crate) init: N,
+    pub(crate) of: F,
+}
+
+impl<I: ExactSizeIterator<Item: Send>, S: Send, N: Fn() -> S + Sync, F: Sync> ParallelMap<I, N, F> {
+    /// Returns the results in the order of the items.
+    pub fn collect<R: Send>(self) -> Vec<R>
+    where
+        F: Fn(&mut S, I::Item) -> R,
+    {
+        let (of, results) = (self.of, Results::default());
+        self.items.for_each_batch(self.init, |state, start, batch| {
+            results.push(start, batch.iter_mut().filter_map(Option::take).map(|item| of(state, item)).collect());
+        });
+        results.in_order()
+    }
+
+    /// Returns the results in the order of the items, if none is an error.
+    ///
+    /// # Errors
+    /// That of the first item that failed; items after it may not have been processed.
+    pub fn try_collect<T: Send, E: Send>(self) -> Result<Vec<T>, E>
+    where
+        F: Fn(&mut S, I::Item) -> Result<T, E>,
+    {
+        let (of, results, first) = (self.of, Results::default(), FirstError::default());
+        self.items.for_each_batch(self.init, |state, start, batch| {
+            let mut done = Vec::with_capacity(batch.len());
+            for (i, item) in (start..).zip(batch) {
+                if first.is_before(i) {
+                    return;
+                }
+                match item.take().map(|item| of(state, item)) {
+                    Some(Ok(result)) => done.push(result),
+                    Some(Err(error)) => return first.set(i, error),
+                    None => {}
+                }
+            }
+            results.push(start, done);
+        });
+        first.into_result().map(|()| results.in_order())
+    }
+}
+
+/// Results of batches, by the index of their first item.
+struct Results<R>(Mutex<Vec<(usize, Vec<R>)>>);
+
+impl<R> Default for Results<R> {
+    fn default() -> Self {
+        Self(Mutex::new(Vec::new()))
+    }
+}
+
+impl<R> Results<R> {
+    fn push(&self, start: usize, batch: Vec<R>) {
+        lock(&self.0).push((start, batch));
+    }
+
+    fn in_order(self) -> Vec<R> {
+        let mut batches = self.0.into_inner().unwrap_or_else(PoisonError::into_inner);
+        batches.sort_unstable_by_key(|batch| batch.0);
+        let mut all = Vec::with_capacity(batches.iter().map(|batch| batch.1.len()).sum());
+        batches.into_iter().for_each(|batch| all.extend(batch.1));
+        all
+    }
+}
