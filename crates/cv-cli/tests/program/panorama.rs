@@ -197,7 +197,7 @@ fn difference(image: &RgbU8, vista: &Vista, ray: impl Fn(f64, f64) -> Vector3<f6
     let (w, h) = image.size();
     let at = |dx: f64, dy: f64| {
         let (mut sum, mut n) = (0.0, 0);
-        for (x, y) in (3..h - 3).step_by(3).flat_map(|y| (3..w - 3).step_by(3).map(move |x| (x, y))) {
+        for (x, y) in (3..h - 3).step_by(9).flat_map(|y| (3..w - 3).step_by(9).map(move |x| (x, y))) {
             if image.at(x, y) == [0; 3] {
                 continue;
             }
