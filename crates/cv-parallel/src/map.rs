@@ -2,7 +2,7 @@
 
 use crate::ParallelIterator;
 use crate::batches::lock;
-use crate::parallel_iterator::FirstError;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 /// Items and what is computed of each, in parallel, when the results are collected. Made by [`ParallelIterator::map`].
@@ -73,5 +73,37 @@ impl<R> Results<R> {
         let mut all = Vec::with_capacity(batches.iter().map(|batch| batch.1.len()).sum());
         batches.into_iter().for_each(|batch| all.extend(batch.1));
         all
+    }
+}
+
+/// The error of the first item that failed.
+struct FirstError<E> {
+    /// Of the item; `usize::MAX` without one.
+    index: AtomicUsize,
+    error: Mutex<Option<E>>,
+}
+
+impl<E> Default for FirstError<E> {
+    fn default() -> Self {
+        Self { index: AtomicUsize::new(usize::MAX), error: Mutex::new(None) }
+    }
+}
+
+impl<E> FirstError<E> {
+    /// Returns whether an item before this one failed, so that this one does not matter.
+    fn is_before(&self, index: usize) -> bool {
+        self.index.load(Ordering::Relaxed) < index
+    }
+
+    fn set(&self, index: usize, error: E) {
+        let mut kept = lock(&self.error);
+        if self.index.fetch_min(index, Ordering::Relaxed) > index {
+            *kept = Some(error);
+        }
+    }
+
+    fn into_result(self) -> Result<(), E> {
+        let error = self.error.into_inner().unwrap_or_else(PoisonError::into_inner);
+        error.map_or(Ok(()), Err)
     }
 }

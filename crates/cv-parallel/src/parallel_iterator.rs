@@ -5,7 +5,6 @@ use crate::batches::{for_each_batch, lock};
 use std::iter::{Enumerate, Skip, Take, Zip};
 use std::slice::{Chunks, ChunksMut, Iter, IterMut};
 use std::sync::Mutex;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Items to be processed in parallel.
 #[derive(Clone, Debug)]
@@ -150,18 +149,8 @@ impl<I: ExactSizeIterator<Item: Send>> ParallelIterator<I> {
         init: impl Fn() -> S + Sync,
         work: impl Fn(&mut S, I::Item) -> Result<(), E> + Sync,
     ) -> Result<(), E> {
-        let first = FirstError::default();
-        self.for_each_batch(init, |state, start, batch| {
-            for (i, item) in (start..).zip(batch) {
-                if first.is_before(i) {
-                    return;
-                }
-                if let Some(Err(error)) = item.take().map(|item| work(state, item)) {
-                    first.set(i, error);
-                }
-            }
-        });
-        first.into_result()
+        // Results of no size take no memory.
+        self.map_init(init, work).try_collect().map(|_| ())
     }
 
     /// Applies `of` to each item; the results are made, in parallel, when they are collected.
@@ -197,42 +186,10 @@ impl<I: ExactSizeIterator<Item: Send>> ParallelIterator<I> {
     }
 }
 
-/// The error of the first item that failed.
-pub(crate) struct FirstError<E> {
-    /// Of the item; `usize::MAX` without one.
-    index: AtomicUsize,
-    error: Mutex<Option<E>>,
-}
-
-impl<E> Default for FirstError<E> {
-    fn default() -> Self {
-        Self { index: AtomicUsize::new(usize::MAX), error: Mutex::new(None) }
-    }
-}
-
-impl<E> FirstError<E> {
-    /// Returns whether an item before this one failed, so that this one does not matter.
-    pub(crate) fn is_before(&self, index: usize) -> bool {
-        self.index.load(Ordering::Relaxed) < index
-    }
-
-    pub(crate) fn set(&self, index: usize, error: E) {
-        let mut kept = lock(&self.error);
-        if self.index.fetch_min(index, Ordering::Relaxed) > index {
-            *kept = Some(error);
-        }
-    }
-
-    pub(crate) fn into_result(self) -> Result<(), E> {
-        let error = self.error.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
-        error.map_or(Ok(()), Err)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::sync::atomic::AtomicBool;
+    use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
     /// Runs a test with one thread and with four.
     fn with_threads(test: impl Fn() + Sync) {

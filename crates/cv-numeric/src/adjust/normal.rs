@@ -13,7 +13,7 @@ pub(super) const DIAGONAL_FLOOR: f64 = 1e-12;
 /// Pivot of an eliminated block, relative to its trace, below which the block is rank deficient.
 const PIVOT_TOLERANCE: f64 = 1e-15;
 /// Number of eliminated blocks per parallel task.
-const POINTS_PER_TASK: usize = 128;
+pub(super) const POINTS_PER_TASK: usize = 128;
 
 /// The normal equations `H δ = −g`, `H = Σ w JᵀJ`, `g = Σ w Jᵀr`, as `[U Wᵀ; W V]` with `V` of the eliminated blocks.
 #[derive(Debug, Clone, Default)]

@@ -2,7 +2,7 @@
 
 use super::error::AdjustError;
 use super::factor::Analysis;
-use super::normal::{DIAGONAL_FLOOR, Normal, Reduced};
+use super::normal::{DIAGONAL_FLOOR, Normal, POINTS_PER_TASK, Reduced};
 use super::residual::{LossModel, ResidualSums, Values};
 use super::structure::Structure;
 use super::{Adjustment, GroupId};
@@ -105,8 +105,6 @@ pub(super) struct Step {
 /// Relative decrease of the cost below which the curvature of the losses is used: near a minimum residuals hardly change, so the
 /// curvature is reliable.
 const CURVATURE_RELATIVE_GAIN: f64 = 0.01;
-/// Number of eliminated blocks per parallel task.
-const BLOCKS_PER_TASK: usize = 512;
 /// Gain ratio from which a step is extended, and the maximum extension factor. (On fountain-P11 with Cauchy loss, 9 iterations then
 /// decrease the cost more than 24 without; at a factor of 4 most extensions are rejected.)
 const MIN_EXTENSION_GAIN_RATIO: f64 = 1.25;
@@ -306,9 +304,9 @@ impl Adjustment<'_> {
         if let Some(points) = &structure.points {
             let group = &self.groups[points.group];
             let n = self.values.ambient[points.group];
-            let parts = moved.numbers[points.group].par_chunks_mut(BLOCKS_PER_TASK * n);
-            let parts = parts.zip(self.values.numbers[points.group].par_chunks(BLOCKS_PER_TASK * n));
-            parts.zip(step.points.par_chunks(BLOCKS_PER_TASK * points.size)).for_each(|((to, x), delta)| {
+            let parts = moved.numbers[points.group].par_chunks_mut(POINTS_PER_TASK * n);
+            let parts = parts.zip(self.values.numbers[points.group].par_chunks(POINTS_PER_TASK * n));
+            parts.zip(step.points.par_chunks(POINTS_PER_TASK * points.size)).for_each(|((to, x), delta)| {
                 let blocks = to.chunks_exact_mut(n).zip(x.chunks_exact(n)).zip(delta.chunks_exact(points.size));
                 blocks.for_each(|((to, x), delta)| group.manifold.step(x, delta, to));
             });
