@@ -1,5 +1,7 @@
 """Small scenes of textured planes, rendered with NumPy alone: cameras and depths are known exactly."""
 
+import functools
+
 import numpy as np
 
 
@@ -51,16 +53,19 @@ def render(planes, matrix, pose, size, oversampling=3):
         for dx in step:
             x, y = np.meshgrid(np.arange(width) + dx, np.arange(height) + dy)
             rays = np.stack([x, y, np.ones_like(x)], axis=2) @ np.linalg.inv(matrix).T @ r
-            nearest, image = np.full(x.shape, np.inf), np.zeros(x.shape + (3,))
-            for origin, u, v, color in planes:
+            center = -r.T @ t
+            nearest, visible = np.full(x.shape, np.inf), np.full(x.shape, -1)
+            for i, (origin, u, v, _) in enumerate(planes):
                 normal = np.cross(u, v)
-                center = -r.T @ t
                 with np.errstate(divide="ignore", invalid="ignore"):
                     distance = ((np.asarray(origin) - center) @ normal) / (rays @ normal)
                 hit = (distance > 0) & (distance < nearest)
-                at = center + rays[hit] * distance[hit, None] - origin
+                nearest[hit], visible[hit] = distance[hit], i
+            image = np.zeros(x.shape + (3,))
+            for i, (origin, u, v, color) in enumerate(planes):
+                hit = visible == i
+                at = center + rays[hit] * nearest[hit, None] - origin
                 image[hit] = color(at @ u, at @ v)
-                nearest[hit] = distance[hit]
             sums += image
             if dx == 0 and dy == 0:
                 depth = nearest
@@ -72,3 +77,21 @@ def room(seed=1):
     x, y, z = np.eye(3)
     wall, other, floor = (texture(10 * seed + i) for i in range(3))
     return [((0, 0, 6), x, y, wall), ((3, 0, 0), z, y, other), ((0, 1.4, 0), x, z, floor)]
+
+
+WALK_MATRIX = np.array([[400.0, 0, 199.5], [0, 400.0, 149.5], [0, 0, 1]])
+WALK_SIZE = (400, 300)
+
+
+def walk_poses():
+    """Poses along a line through the room, each rotated a little more to the right."""
+    for i in range(5):
+        turn = rotation(0.02 * (i % 2), 0.25 - 0.07 * i, 0)
+        center = np.array([-0.6 + 0.45 * i, 0.05 * (i % 2), -0.1 * i])
+        yield turn, -turn @ center
+
+
+@functools.cache
+def walk():
+    """Returns five photographs of the room from `walk_poses`."""
+    return tuple(render(room(), WALK_MATRIX, pose, WALK_SIZE)[0] for pose in walk_poses())

@@ -34,11 +34,7 @@ def photographs(tmp_path_factory):
         middle = np.array([*random.uniform(-0.03, 0.03, 2), random.uniform(0.7, 0.85)])
         pose = tilt, middle - tilt @ np.array([3.5 * 0.034, 2 * 0.034, 0])
         epipole.write_image(folder / f"board{i:02}.png", scenes.render(board, matrix, pose, (320, 240))[0])
-    for i in range(5):
-        turn = scenes.rotation(0.02 * (i % 2), 0.25 - 0.07 * i, 0)
-        center = np.array([-0.6 + 0.45 * i, 0.05 * (i % 2), -0.1 * i])
-        matrix = np.array([[400.0, 0, 199.5], [0, 400.0, 149.5], [0, 0, 1]])
-        image, _ = scenes.render(scenes.room(), matrix, (turn, -turn @ center), (400, 300))
+    for i, image in enumerate(scenes.walk()):
         epipole.write_image(folder / f"walk{i}.png", image)
     return folder
 

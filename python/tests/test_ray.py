@@ -135,13 +135,10 @@ def test_every_other_job_runs_on_the_cluster(cluster, tmp_path):
 
 
 def test_many_views_with_features_from_the_cluster(cluster, tmp_path):
-    matrix = np.array([[400.0, 0, 199.5], [0, 400.0, 149.5], [0, 0, 1]])
     paths = [tmp_path / f"{i}.png" for i in range(5)]
-    for i, path in enumerate(paths[:4]):
-        turn = scenes.rotation(0.02 * (i % 2), 0.25 - 0.07 * i, 0)
-        center = np.array([-0.6 + 0.45 * i, 0.05 * (i % 2), -0.1 * i])
-        epipole.write_image(path, scenes.render(scenes.room(), matrix, (turn, -turn @ center), (400, 300))[0])
-    camera = epipole.Camera(400, 300, matrix)
+    for path, image in zip(paths[:4], scenes.walk()):
+        epipole.write_image(path, image)
+    camera = epipole.Camera(*scenes.WALK_SIZE, scenes.WALK_MATRIX)
     found = epipole.ray.sfm(paths, tmp_path / "features", camera=camera)
     assert list(found.left_out) == ["4.png"] and "FileNotFoundError" in found.left_out["4.png"]["message"]
     expected = epipole.sfm(paths[:4], camera=camera)

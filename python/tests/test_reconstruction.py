@@ -7,22 +7,13 @@ import numpy as np
 import pytest
 import scenes
 from epipole import errors
-
-MATRIX = np.array([[400.0, 0, 199.5], [0, 400.0, 149.5], [0, 0, 1]])
-SIZE = (400, 300)
-
-
-def walk():
-    """Returns poses along a line, each rotated a little more to the right."""
-    for i in range(5):
-        turn = scenes.rotation(0.02 * (i % 2), 0.25 - 0.07 * i, 0)
-        center = np.array([-0.6 + 0.45 * i, 0.05 * (i % 2), -0.1 * i])
-        yield turn, -turn @ center
+from scenes import WALK_MATRIX as MATRIX
+from scenes import WALK_SIZE as SIZE
 
 
 @pytest.fixture(scope="module")
 def photographs():
-    return [scenes.render(scenes.room(), MATRIX, pose, SIZE)[0] for pose in walk()]
+    return list(scenes.walk())
 
 
 def angle(a, b):
@@ -34,7 +25,7 @@ def angle(a, b):
 def test_the_relative_pose_of_two_photographs(photographs, tmp_path):
     camera = epipole.Camera(*SIZE, MATRIX)
     found = epipole.reconstruct(photographs[0], photographs[1], camera=camera, dense=True)
-    (r0, t0), (r1, t1) = list(walk())[:2]
+    (r0, t0), (r1, t1) = list(scenes.walk_poses())[:2]
     # The target for generated pairs.
     assert angle(found.rotation, r1 @ r0.T) < 0.2
     direction = t1 - r1 @ r0.T @ t0
@@ -63,7 +54,7 @@ def test_degenerate_pairs_raise_their_exception(photographs):
 
 def test_many_photographs(photographs, tmp_path):
     camera = epipole.Camera(*SIZE, MATRIX)
-    truth = list(walk())
+    truth = list(scenes.walk_poses())
     centers = np.array([-r.T @ t for r, t in truth])
     gray = np.full((300, 400), 128, np.uint8)
     names = [f"{i}.png" for i in range(5)] + ["gray.png"]
@@ -95,7 +86,7 @@ def test_many_photographs(photographs, tmp_path):
 
 def test_positions_and_distances_georeference_the_model(photographs, tmp_path):
     camera = epipole.Camera(*SIZE, MATRIX)
-    centers = np.array([-r.T @ t for r, t in walk()])
+    centers = np.array([-r.T @ t for r, t in scenes.walk_poses()])
     between = np.linalg.norm(centers[4] - centers[0])
     found = epipole.sfm(photographs, camera=camera, distances=[(0, 4, 10 * between)])
     first, last = (found.model.images[i].center for i in (1, 5))
