@@ -272,7 +272,7 @@ mod tests {
             Piece::new(warped, vec![0.3; n], vec![0.0; n], 100.0)
         };
         let pieces = (0..3).map(piece).collect();
-        (Preview { step: 1, width: SIZE.0, height: SIZE.1, pieces }, gains(&[2.0, 0.0, -2.0]))
+        (Preview { step: 1, width: SIZE.0, height: SIZE.1, full_circle: false, pieces }, gains(&[2.0, 0.0, -2.0]))
     }
 
     #[test]

@@ -116,7 +116,13 @@ mod tests {
             let n = bounds.width() * bounds.height();
             Piece::new(drawn(*bounds, |_, _| [9; 3]), vec![0.0; n], vec![0.0; n], 9.0)
         };
-        let preview = Preview { step: 4, width: SIZE.0, height: SIZE.1, pieces: boxes.iter().map(piece).collect() };
+        let preview = Preview {
+            step: 4,
+            width: SIZE.0,
+            height: SIZE.1,
+            full_circle: false,
+            pieces: boxes.iter().map(piece).collect(),
+        };
         let view = View { camera: Camera::from_focal(80, 80, 80.0), from_world: Matrix3::identity() };
         let origin = Point2::new(0.0, 0.0);
         let placement = |bounds: &Bounds| Placement { photo: 0, view, bounds: *bounds, origin };

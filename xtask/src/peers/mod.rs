@@ -12,6 +12,7 @@ mod feature_quality;
 mod features;
 mod geometry;
 mod panorama;
+mod panorama_border;
 mod panorama_people;
 mod panorama_truth;
 mod sfm;

@@ -3,6 +3,7 @@
 //!
 //! Hugin takes half a minute for a set: its output is cached in `peers-panorama` of the target folder until its script changes.
 
+use super::panorama_border;
 use super::panorama_people::{self, People};
 use super::panorama_truth::{self, Truth};
 use crate::checks::Check;
@@ -76,6 +77,11 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
         others.push(Check::at_least(format!("{name}: photographs used"), used, images.len() as f64));
         others.extend(mean_checks(name, mean_level(result.image.pixels()), range_of_means(&images)));
         others.push(Check::at_most(format!("{name}: {LOST}"), lost, 0.005));
+        if panorama_border::is_full_circle(&result) {
+            let step = panorama_border::relative_step(&result.image, &result.mask);
+            let figure = "step at the border of 360° / largest between columns within 40 px of it";
+            others.push(Check::at_most(format!("{name}: {figure}"), step, 1.0));
+        }
     }
     let poisson = poisson_ratio(data, python, &program, &cache)?;
     println!("{LARGE}");

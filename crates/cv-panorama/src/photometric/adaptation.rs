@@ -345,7 +345,7 @@ mod tests {
             let radius = eccentricity.iter().map(|e| 0.7 * e).collect();
             Piece::new(warped, eccentricity, radius, 0.0)
         });
-        let preview = Preview { step: 1, width: 90, height: 40, pieces: pieces.collect() };
+        let preview = Preview { step: 1, width: 90, height: 40, full_circle: false, pieces: pieces.collect() };
         let gain = |stops: f32| [stops.exp2(); 3];
         (preview, Gains { gains: vec![gain(0.5 * stops), gain(-0.5 * stops)], ..Gains::none(2) })
     }

@@ -412,7 +412,7 @@ mod tests {
                 piece(bounds, pixels, radius)
             })
             .collect();
-        Preview { step: 1, width: 120, height: 40, pieces }
+        Preview { step: 1, width: 120, height: 40, full_circle: false, pieces }
     }
 
     fn estimate(preview: &Preview) -> Gains {
@@ -518,7 +518,8 @@ mod tests {
             let pixels = Image::from_fn(60, 40, |x, _| [value(x), value(x), value(x), 255]);
             piece(bounds, pixels, vec![0.0; 60 * 40])
         };
-        let mut set = Preview { step: 1, width: 90, height: 40, pieces: vec![shifted(0), shifted(1)] };
+        let mut set =
+            Preview { step: 1, width: 90, height: 40, full_circle: false, pieces: vec![shifted(0), shifted(1)] };
         let gains = estimate_gains(&set, &[0, 1], 2, Exposure::Match, &Silent).unwrap();
         set.correct(&gains, None, &[0, 1]);
         let level = |x: usize| f64::from(set.pieces[usize::from(x >= 60)].warped.color(x, 7).unwrap()[0]);

@@ -8,7 +8,7 @@ use cv_imgproc::GridCut;
 use cv_parallel::prelude::*;
 
 /// Smoothness cost per unit of seam length.
-const LENGTH_COST: i32 = 4 * 3;
+pub(super) const LENGTH_COST: i32 = 4 * 3;
 
 /// The energy of a labeling: data term and smoothness term.
 pub(super) struct Labeling<'a, U, D, F> {
@@ -20,7 +20,13 @@ pub(super) struct Labeling<'a, U, D, F> {
     pub(super) difference: D,
     /// Returns which pixels of a row may change their labels.
     pub(super) free: F,
+    /// Of a canvas that spans 360°: the smoothness term of a label at a pixel of the first or last column and another at the pixel beyond that border, in the other of
+    /// these columns, `beyond(label, other, x, y)`.
+    pub(super) beyond: Option<&'a BeyondCost<'a>>,
 }
+
+/// See [`Labeling::beyond`].
+pub(super) type BeyondCost<'a> = dyn Fn(usize, usize, usize, usize) -> i32 + Sync + 'a;
 
 /// Pixels of a row that are skipped at once where none may change its label.
 const RUN: usize = 32;
@@ -40,7 +46,8 @@ where
     /// Expands every label in turn until the energy no longer decreases, at most `rounds` times.
     pub(super) fn expand(&self, labels: &mut Image<u16, 1>, rounds: usize, stage: &Stage<'_>) -> Result<(), Cancelled> {
         let bounds: Vec<Option<Bounds>> = self.photos.iter().map(|photo| photo.map(|p| p.bounds)).collect();
-        let groups = independent_groups(&bounds);
+        let circle = self.beyond.map(|_| labels.width());
+        let groups = independent_groups(&bounds, circle);
         // A label is tried again only if a label near it changed.
         let mut stale = vec![true; self.photos.len()];
         for _ in 0..rounds {
@@ -53,7 +60,7 @@ where
                 for (&alpha, changed) in turn.iter().zip(&changes).filter(|(_, changed)| !changed.is_empty()) {
                     changed.iter().for_each(|&i| labels.as_mut_slice()[i] = alpha as u16);
                     for (other, s) in stale.iter_mut().enumerate() {
-                        *s |= other != alpha && touch(&bounds, other, alpha);
+                        *s |= other != alpha && touch(&bounds, circle, other, alpha);
                     }
                 }
             }
@@ -136,6 +143,13 @@ where
                 let switch = if q == alpha { 0 } else { LENGTH_COST + here + differ(alpha, q, nx, ny) };
                 add_signed(&mut cut, i, switch - keep);
             }
+            if let Some(beyond) = self.beyond.filter(|_| x == 0 || x + 1 == width) {
+                let q = label_at(width - 1 - x, y);
+                if q != NO_PHOTO {
+                    let q = usize::from(q);
+                    add_signed(&mut cut, i, beyond(alpha, q, x, y) - beyond(p, q, x, y));
+                }
+            }
             for (j, nx, ny) in
                 [(right, x + 1, y), (below, x, y + 1)].into_iter().filter_map(|(j, x, y)| Some((j?, x, y)))
             {
@@ -169,17 +183,18 @@ where
     }
 }
 
-/// Returns whether the bounds of two photographs overlap or touch.
-fn touch(bounds: &[Option<Bounds>], a: usize, b: usize) -> bool {
+/// Returns whether the bounds of two photographs overlap or touch, also across the border of a canvas that spans 360°, of width `circle`.
+fn touch(bounds: &[Option<Bounds>], circle: Option<usize>, a: usize, b: usize) -> bool {
     let (Some(a), Some(b)) = (bounds[a], bounds[b]) else { return false };
-    a.grown(1, usize::MAX, usize::MAX).intersection(&b).is_some()
+    let meet = |a: Bounds, b: Bounds| a.left == 0 && circle.is_some_and(|width| b.right >= width);
+    meet(a, b) || meet(b, a) || a.grown(1, usize::MAX, usize::MAX).intersection(&b).is_some()
 }
 
-/// Partitions the photographs into groups that do not touch: expansions within a group are independent and run in parallel.
-pub(super) fn independent_groups(bounds: &[Option<Bounds>]) -> Vec<Vec<usize>> {
+/// Partitions the photographs into groups that do not [`touch`]: expansions within a group are independent and run in parallel.
+pub(super) fn independent_groups(bounds: &[Option<Bounds>], circle: Option<usize>) -> Vec<Vec<usize>> {
     let mut groups: Vec<Vec<usize>> = Vec::new();
     for k in 0..bounds.len() {
-        match groups.iter_mut().find(|group| group.iter().all(|&other| !touch(bounds, k, other))) {
+        match groups.iter_mut().find(|group| group.iter().all(|&other| !touch(bounds, circle, k, other))) {
             Some(group) => group.push(k),
             None => groups.push(vec![k]),
         }
@@ -254,6 +269,7 @@ mod tests {
                 unary: |l, x, y| self.unary(l, x, y),
                 difference: |a, b, x, y| self.difference(a, b, x, y),
                 free: |y: usize| &self.free[3 * y..3 * y + 3],
+                beyond: None,
             };
             labeling.expand(&mut found, rounds, &stage()).unwrap();
             found.into_vec()
@@ -299,14 +315,18 @@ mod tests {
     fn photographs_that_touch_are_never_tried_at_once() {
         let at = |left: usize, top: usize| Some(Bounds { left, top, right: left + 10, bottom: top + 10 });
         let photos = [at(0, 0), at(10, 0), at(21, 0), at(0, 11), at(40, 40), None];
-        let groups = independent_groups(&photos);
+        let groups = independent_groups(&photos, None);
         assert_eq!(groups.iter().map(Vec::len).sum::<usize>(), photos.len());
         for group in &groups {
             for (i, a) in group.iter().enumerate() {
-                assert!(group[i + 1..].iter().all(|b| !touch(&photos, *a, *b)), "{groups:?}");
+                assert!(group[i + 1..].iter().all(|b| !touch(&photos, None, *a, *b)), "{groups:?}");
             }
         }
         // The first two are neighbors, the others lie apart from the first.
         assert_eq!(groups, [vec![0, 2, 3, 4, 5], vec![1]]);
+        // Across the border of a canvas that spans 360°, too.
+        let ends = [at(0, 0), at(30, 0), at(50, 0)];
+        assert_eq!(independent_groups(&ends, None), [vec![0, 1, 2]]);
+        assert_eq!(independent_groups(&ends, Some(60)), [vec![0, 1], vec![2]]);
     }
 }

@@ -5,6 +5,7 @@
 //! preview first, then in full resolution in a band around the seams.
 
 mod alpha_expansion;
+mod border;
 mod contradiction;
 mod cost;
 mod misalignment;
@@ -18,7 +19,7 @@ pub(crate) use windows::{refine_in_windows, window_memory};
 use crate::blend::NO_PHOTO;
 use crate::rows::{for_each_row, is_check_due};
 use crate::surface::{Bounds, Piece, Preview, WarpedPhoto};
-use alpha_expansion::Labeling;
+use alpha_expansion::{BeyondCost, Labeling};
 use contradiction::contradiction;
 use cost::difference;
 use cv_core::{Cancelled, Image, Progress, Stage, named};
@@ -107,7 +108,10 @@ pub(crate) fn on_preview(
             None => (voronoi(level), vec![true; level.width * level.height]),
             Some(coarse) => {
                 let labels = upsampled(coarse, level);
-                let near = seam_band(&labels, BAND_RADIUS, &stage)?;
+                let mut near = seam_band(&labels, BAND_RADIUS, &stage)?;
+                if preview.full_circle {
+                    border::add_band(&mut near, &labels, photo_of, BAND_RADIUS);
+                }
                 (labels, near)
             }
         };
@@ -144,7 +148,10 @@ pub(crate) fn on_preview(
         let free = |y: usize| &near[y * level.width..(y + 1) * level.width];
         // Further rounds hardly lower the energy.
         let rounds = if coarse.is_none() { 2 } else { 1 };
-        Labeling { photos: &reach, unary, difference: differ, free }.expand(&mut labels, rounds, &stage)?;
+        let beyond =
+            |own: usize, other: usize, x: usize, y: usize| border::cost(level, photo_of, &differ, own, other, (x, y));
+        let beyond: Option<&BeyondCost<'_>> = if preview.full_circle { Some(&beyond) } else { None };
+        Labeling { photos: &reach, unary, difference: differ, free, beyond }.expand(&mut labels, rounds, &stage)?;
         coarse = Some(labels);
         stage.add(1)?;
     }
@@ -212,7 +219,8 @@ pub(crate) fn refine(
     let width = labels.width();
     let differ = |a: usize, c: usize, x: usize, y: usize| difference(pieces[a], pieces[c], x, y);
     let free = |y: usize| &near[y * width..(y + 1) * width];
-    Labeling { photos: &pieces, unary: |_, _, _| 0, difference: differ, free }.expand(labels, 1, &stage)?;
+    Labeling { photos: &pieces, unary: |_, _, _| 0, difference: differ, free, beyond: None }
+        .expand(labels, 1, &stage)?;
     stage.add(1)
 }
 
@@ -239,7 +247,8 @@ fn refine_blocks(
     let differ = |a: usize, c: usize, x: usize, y: usize| block_difference(photos, a, c, x, y);
     let free = |y: usize| &near[y * across..(y + 1) * across];
     let mut after = before.clone();
-    Labeling { photos: &reached, unary: |_, _, _| 0, difference: differ, free }.expand(&mut after, 1, stage)?;
+    Labeling { photos: &reached, unary: |_, _, _| 0, difference: differ, free, beyond: None }
+        .expand(&mut after, 1, stage)?;
     for (i, (old, new)) in before.pixels().zip(after.pixels()).enumerate() {
         let (left, top) = (BLOCK * (i % across), BLOCK * (i / across));
         let Some(Some(photo)) = photos.get(usize::from(new[0])).filter(|_| old != new) else { continue };
@@ -396,7 +405,13 @@ mod tests {
                 .collect();
             Piece::new(drawn(bounds, |x, y| scene(x, y, pole)), eccentricity.clone(), eccentricity, 0.0)
         };
-        Preview { step: 1, width: SIZE.0, height: SIZE.1, pieces: vec![piece(0, 120, 70), piece(40, 160, 82)] }
+        Preview {
+            step: 1,
+            width: SIZE.0,
+            height: SIZE.1,
+            full_circle: false,
+            pieces: vec![piece(0, 120, 70), piece(40, 160, 82)],
+        }
     }
 
     /// What a seam costs in gray levels, by the colors on both of its sides.

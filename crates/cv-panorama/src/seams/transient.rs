@@ -72,7 +72,13 @@ mod tests {
             let warped = drawn(bounds, color);
             Piece::new(warped, eccentricity.clone(), eccentricity, 100.0)
         };
-        Preview { step: 1, width: SIZE.0, height: SIZE.1, pieces: (0..photographs).map(piece).collect() }
+        Preview {
+            step: 1,
+            width: SIZE.0,
+            height: SIZE.1,
+            full_circle: false,
+            pieces: (0..photographs).map(piece).collect(),
+        }
     }
 
     /// Pixels of the composite that show a person.

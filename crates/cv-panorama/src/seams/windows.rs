@@ -45,7 +45,7 @@ pub(crate) fn refine_in_windows<T: Internals>(
     stage.add(1)?;
     let before = labels.clone();
     let (width, height) = labels.size();
-    for group in independent_groups(&bounds) {
+    for group in independent_groups(&bounds, None) {
         for batch in group.chunks(at_once) {
             let expand = |&alpha: &usize| -> Result<Vec<(usize, usize)>, RenderError> {
                 let Some(own) = bounds[alpha] else { return Ok(Vec::new()) };
@@ -59,6 +59,7 @@ pub(crate) fn refine_in_windows<T: Internals>(
                     unary: |_, _, _| 0,
                     difference: |a: usize, c: usize, x: usize, y: usize| difference(pieces[a], pieces[c], x, y),
                     free: |y: usize| &free[y * names.width()..(y + 1) * names.width()],
+                    beyond: None,
                 };
                 let changed = labeling.expand_one(&names, alpha, &stage)?;
                 stage.add(1)?;
@@ -151,7 +152,7 @@ fn refine_blocks<T: Internals>(
     let mut after = before.clone();
     // Groups are those of the blocks, as they may differ from those of the pixels.
     let of_blocks: Vec<Option<Bounds>> = bounds.iter().map(|b| b.map(super::block_bounds)).collect();
-    for group in independent_groups(&of_blocks) {
+    for group in independent_groups(&of_blocks, None) {
         for batch in group.chunks(at_once) {
             let current = &after;
             let expand = |&alpha: &usize| -> Result<Vec<usize>, RenderError> {
@@ -177,6 +178,7 @@ fn refine_blocks<T: Internals>(
                     unary: |_, _, _| 0,
                     difference: |a: usize, c: usize, x: usize, y: usize| super::block_difference(&pieces, a, c, x, y),
                     free: |y: usize| &near[(blocks.top + y) * across..(blocks.top + y + 1) * across][blocks.left..],
+                    beyond: None,
                 };
                 let changed = labeling.expand_one(&names, alpha, stage)?;
                 let global = |i: usize| (blocks.top + i / blocks.width()) * across + blocks.left + i % blocks.width();

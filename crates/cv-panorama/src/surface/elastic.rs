@@ -38,6 +38,8 @@ const CELLS: f64 = 24.0;
 const SMOOTHNESS: f64 = 0.15;
 /// Weight of the damping term: a displacement decays over √(SMOOTHNESS / DAMPING) = 5 cells, a fifth of a photograph.
 const DAMPING: f64 = 0.006;
+/// Weight of the continuity of a photograph across the border of a canvas that spans 360°, relative to a tie point: dominates the tie points of a cell.
+const CONTINUITY: f64 = 30.0;
 /// Rounds of iteratively reweighted least squares.
 const ROUNDS: u32 = 5;
 /// Tolerance of the conjugate gradients in the last round: a thousandth of a pixel.
@@ -87,8 +89,9 @@ where
     let mut fields: Vec<_> = layout.placements.iter().map(|p| DisplacementField::over(&p.bounds, spacing)).collect();
     let mut ties = feature_ties(layout, alignment, MAX_DISPLACEMENT_RATIO * side, stage)?;
     ties.retain(|t| !is_removed(masks, layout, t.p, t.a) && !is_removed(masks, layout, t.q, t.b));
+    let continuity = border_ties(layout, spacing);
     // Feature positions have errors of up to a pixel, registered patches of a fraction.
-    solve(&mut fields, &ties, 3.0, stage)?;
+    solve(&mut fields, &ties, &continuity, 3.0, stage)?;
     stage.add(1)?;
     let mut sites = patch_sites(layout, spacing);
     sites.retain(|site| ![site.p, site.q].iter().any(|&k| is_removed_near(masks, layout, k, site.at, WINDOW_RADIUS)));
@@ -99,7 +102,7 @@ where
         ties.truncate(features);
         ties.extend(sites.iter().filter_map(|site| site.tie));
         stage.add(1)?;
-        solve(&mut fields, &ties, 3.0, stage)?;
+        solve(&mut fields, &ties, &continuity, 3.0, stage)?;
         stage.add(1)?;
     }
     for (field, placement) in fields.iter_mut().zip(&layout.placements) {
@@ -146,8 +149,32 @@ fn feature_ties(
     Ok(ties)
 }
 
-/// Solves for the fields by iteratively reweighted least squares (Cauchy weights of `scale` pixels) and conjugate gradients.
-fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage: &Stage<'_>) -> Result<(), Cancelled> {
+/// Returns positions along the border of a canvas that spans 360°, on both sides of it, of the photographs across it. Both sides have the same displacement there, in two placements of the photograph or, if it shows a pole, in one.
+fn border_ties(layout: &Layout, spacing: f64) -> Vec<TiePoint> {
+    let Some(period) = layout.surface.period().filter(|_| layout.full_circle) else { return Vec::new() };
+    let mut ties = Vec::new();
+    for (p, left) in layout.placements.iter().enumerate().filter(|(_, p)| p.bounds.left == 0) {
+        let beyond = |q: &Placement| q.photo == left.photo && q.bounds.right == layout.width;
+        for (q, right) in layout.placements.iter().enumerate().filter(|(_, q)| beyond(q)) {
+            let rows = left.bounds.top.max(right.bounds.top)..left.bounds.bottom.min(right.bounds.bottom);
+            for y in rows.step_by(spacing as usize) {
+                // The border is half a pixel left of the center of the first column.
+                let a = Point2::new(-0.5, y as f64);
+                ties.push(TiePoint { p, q, a, b: a + Vector2::new(period, 0.0), normal: None });
+            }
+        }
+    }
+    ties
+}
+
+/// Solves for the fields by iteratively reweighted least squares (Cauchy weights of `scale` pixels) and conjugate gradients; `continuity` are positions at which two fields are equal.
+fn solve(
+    fields: &mut [DisplacementField],
+    ties: &[TiePoint],
+    continuity: &[TiePoint],
+    scale: f64,
+    stage: &Stage<'_>,
+) -> Result<(), Cancelled> {
     let mut offsets = vec![0];
     for f in fields.iter() {
         offsets.push(offsets[offsets.len() - 1] + f.displacement.len());
@@ -155,16 +182,15 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
     let n = offsets[fields.len()];
     /// A residual: eight vertices with signed weights, the displacement to be compensated, and the direction in which it is known.
     type Term = ([(usize, f64); 8], Vector2<f64>, Option<Vector2<f64>>);
-    let terms: Vec<Term> = ties
-        .iter()
-        .map(|t| {
-            let (a, b) = (fields[t.p].around(t.a), fields[t.q].around(t.b));
-            let term = |k: usize| {
-                if k < 4 { (offsets[t.p] + a[k].0, a[k].1) } else { (offsets[t.q] + b[k - 4].0, -b[k - 4].1) }
-            };
-            (std::array::from_fn(term), t.b - t.a, t.normal)
-        })
-        .collect();
+    let vertices = |t: &TiePoint| {
+        let (a, b) = (fields[t.p].around(t.a), fields[t.q].around(t.b));
+        let term = |k: usize| {
+            if k < 4 { (offsets[t.p] + a[k].0, a[k].1) } else { (offsets[t.q] + b[k - 4].0, -b[k - 4].1) }
+        };
+        std::array::from_fn(term)
+    };
+    let mut terms: Vec<Term> = ties.iter().map(|t| (vertices(t), t.b - t.a, t.normal)).collect();
+    terms.extend(continuity.iter().map(|t| (vertices(t), Vector2::zeros(), None)));
     let mut edges = Vec::new();
     for (f, offset) in fields.iter().zip(&offsets) {
         for y in 0..f.rows {
@@ -188,7 +214,8 @@ fn solve(fields: &mut [DisplacementField], ties: &[TiePoint], scale: f64, stage:
             let residual = TiePoint::measured(*normal, left(&d, t) - want);
             1.0 / (1.0 + residual.norm_squared() / (scale * scale))
         };
-        let weights: Vec<f64> = terms.iter().map(weight).collect();
+        let weights = terms[..ties.len()].iter().map(weight);
+        let weights: Vec<f64> = weights.chain(continuity.iter().map(|_| CONTINUITY)).collect();
         let apply = |x: &[Vector2<f64>]| {
             let mut out: Vec<Vector2<f64>> = x.iter().map(|v| v * DAMPING).collect();
             for &(i, j) in &edges {
@@ -686,6 +713,39 @@ mod tests {
     }
 
     #[test]
+    fn a_photograph_across_the_border_of_a_full_circle_continues_there() {
+        let views: Vec<View> = (0..12).map(|k| view(f64::from(k) * std::f64::consts::PI / 6.0)).collect();
+        let layout = layout(&alignment(&views), Projection::Cylindrical, &Framing::default(), 1.0, 1_000_000).unwrap();
+        assert!(layout.full_circle);
+        let continuity = border_ties(&layout, 10.0);
+        // Rows 10 px apart of at least one photograph 180 px high.
+        assert!(continuity.len() > 12, "{}", continuity.len());
+        for tie in &continuity {
+            assert_eq!(layout.placements[tie.p].photo, layout.placements[tie.q].photo);
+        }
+        // In the overlap with its neighbor the content of the photograph on the left is displaced.
+        let left = continuity[0].p;
+        let overlap = |k: usize| layout.placements[left].bounds.intersection(&layout.placements[k].bounds);
+        let found = (0..layout.placements.len()).find_map(|k| Some((k, overlap(k).filter(|_| k != left)?)));
+        let (other, common) = found.unwrap();
+        let rows = (common.top + 10..common.bottom - 10).step_by(10);
+        let ties: Vec<TiePoint> = rows
+            .map(|y| Point2::new(common.left as f64 + 5.0, y as f64))
+            .map(|a| TiePoint { p: left, q: other, a, b: a + Vector2::new(3.0, -2.0), normal: None })
+            .collect();
+        let step = |continuity: &[TiePoint]| -> f64 {
+            let mut fields: Vec<_> =
+                layout.placements.iter().map(|p| DisplacementField::over(&p.bounds, 10.0)).collect();
+            solve(&mut fields, &ties, continuity, 3.0, &stage()).unwrap();
+            let steps =
+                super::border_ties(&layout, 10.0).into_iter().map(|t| fields[t.p].at(t.a) - fields[t.q].at(t.b));
+            steps.map(|v| v.norm()).fold(0.0, f64::max)
+        };
+        // Half of the displacement is that of either photograph; a twentieth of a pixel is invisible.
+        assert!(step(&[]) > 1.0 && step(&continuity) < 0.05, "{} {}", step(&[]), step(&continuity));
+    }
+
+    #[test]
     fn an_edge_in_noise_is_registered_across_and_ties_only_in_that_direction() {
         let mut state = 5_u32;
         let mut noise = || {
@@ -713,7 +773,7 @@ mod tests {
             .map(|k| at(20.0 + 20.0 * f64::from(k % 8), 10.0 + 18.0 * f64::from(k / 8)))
             .map(|a| TiePoint { p: 0, q: 1, a, b: a + Vector2::new(3.0, 7.0), normal: Some(Vector2::x()) })
             .collect();
-        solve(&mut fields, &ties, 3.0, &stage()).unwrap();
+        solve(&mut fields, &ties, &[], 3.0, &stage()).unwrap();
         let apart = fields[0].at(at(100.0, 50.0)) - fields[1].at(at(100.0, 50.0));
         // The damping, 0.006 a vertex, takes a hundredth of it.
         assert!((apart.x - 3.0).abs() < 0.1 && apart.y.abs() < 1e-6, "{apart}");

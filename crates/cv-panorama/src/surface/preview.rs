@@ -15,6 +15,8 @@ pub(crate) struct Preview {
     pub(crate) step: usize,
     pub(crate) width: usize,
     pub(crate) height: usize,
+    /// Whether it spans 360°: the right edge continues at the left one.
+    pub(crate) full_circle: bool,
     /// In the order of the layout's placements.
     pub(crate) pieces: Vec<Piece>,
 }
@@ -205,7 +207,8 @@ impl Preview {
         };
         let pieces: Vec<Option<Piece>> =
             layout.placements.par_iter().enumerate().map(draw).try_collect::<_, Cancelled>()?;
-        Ok(Self { step, width, height, pieces: pieces.into_iter().flatten().collect() })
+        let full_circle = layout.full_circle;
+        Ok(Self { step, width, height, full_circle, pieces: pieces.into_iter().flatten().collect() })
     }
 
     /// Applies the exposure correction to every piece.
@@ -220,7 +223,7 @@ impl Preview {
     /// Returns the preview at half resolution.
     pub(crate) fn halved(&self) -> Self {
         let pieces = self.pieces.par_iter().map(Piece::halved).collect();
-        Self { step: 2 * self.step, width: self.width / 2, height: self.height / 2, pieces }
+        Self { step: 2 * self.step, width: self.width / 2, height: self.height / 2, pieces, ..*self }
     }
 }
 
