@@ -1,12 +1,12 @@
-//! Encoding images as PNG, JPEG and TIFF.
+//! Encoding images as PNG and TIFF, and by the extension of the file's name.
 
 use std::io::Write;
 use std::path::Path;
 
 use cv_core::ImageView;
-use jpeg_encoder::JpegColorType;
 use png::{BitDepth, ColorType, Compression, Filter};
 
+use crate::encode_jpeg::{JPEG_QUALITY, encode_jpeg_parts};
 use crate::encode_rows::write_image_rows;
 use crate::encode_tiff::{Samples, encode_samples};
 use crate::files::write_bytes;
@@ -124,119 +124,8 @@ pub fn write_png_to_print(path: impl AsRef<Path>, view: impl PngPixels, dpi: f64
     write_bytes(path, &bytes.map_err(|reason| IoError::writing(path, reason))?)
 }
 
-/// Image types that can be written as JPEG: 8-bit views of 1 or 3 channels.
-pub trait JpegPixels: PngPixels {}
-impl JpegPixels for ImageView<'_, u8, 1> {}
-impl JpegPixels for ImageView<'_, u8, 3> {}
-
-/// Encodes a JPEG file at `quality` 1 to 100 (95 is visually lossless). Chroma is not subsampled from 90 on.
-///
-/// # Errors
-/// [`FormatError::NotRepresentable`] for an empty image or one with a side above 65535.
-pub fn encode_jpeg(view: impl JpegPixels, quality: u8) -> Result<Vec<u8>, FormatError> {
-    encode_jpeg_parts(view.parts(), quality, &Metadata::default())
-}
-
-pub(crate) fn encode_jpeg_parts(
-    (width, height, color, _, pixels): Parts,
-    quality: u8,
-    metadata: &Metadata,
-) -> Result<Vec<u8>, FormatError> {
-    let side = |n: usize| u16::try_from(n).ok().filter(|&n| n > 0);
-    let (Some(w), Some(h)) = (side(width), side(height)) else {
-        return Err(FormatError::NotRepresentable { format: "JPEG", what: format!("an image of {width}×{height}") });
-    };
-    let channels = color.samples();
-    let mut bytes = Vec::new();
-    encode_jpeg_rows(
-        &mut bytes,
-        JpegRows { width: w, height: h, channels, pixels: &pixels },
-        channels,
-        quality,
-        metadata,
-    )?;
-    Ok(bytes)
-}
-
-/// Encodes a JPEG whose rows are requested from `image`, from the top.
-pub(crate) fn encode_jpeg_rows<W: Write>(
-    sink: W,
-    image: impl jpeg_encoder::ImageBuffer,
-    channels: usize,
-    quality: u8,
-    metadata: &Metadata,
-) -> Result<(), FormatError> {
-    let (w, h) = (image.width(), image.height());
-    let mut encoder = jpeg_encoder::Encoder::new(sink, quality.clamp(1, 100));
-    let fail = |e: jpeg_encoder::EncodingError| FormatError::corrupt("JPEG", e.to_string());
-    let exif = metadata.exif_for(w.into(), h.into()).map(|block| [&b"Exif\0\0"[..], &block].concat());
-    // The maximum of a segment; EXIF blocks without thumbnail are far smaller.
-    if let Some(exif) = exif.filter(|exif| exif.len() <= 65_533) {
-        encoder.add_app_segment(1, exif).map_err(fail)?;
-    }
-    if let Some(profile) = metadata.icc_for(channels) {
-        encoder.add_icc_profile(profile).map_err(fail)?;
-    }
-    encoder.encode_image(image).map_err(fail)
-}
-
-/// Pixels for the encoder. (Its own `encode` would be compiled for nine pixel types.)
-struct JpegRows<'a> {
-    width: u16,
-    height: u16,
-    /// 1 or 3.
-    channels: usize,
-    pixels: &'a [u8],
-}
-
-impl jpeg_encoder::ImageBuffer for JpegRows<'_> {
-    fn get_jpeg_color_type(&self) -> JpegColorType {
-        if self.channels == 1 { JpegColorType::Luma } else { JpegColorType::Ycbcr }
-    }
-
-    fn width(&self) -> u16 {
-        self.width
-    }
-
-    fn height(&self) -> u16 {
-        self.height
-    }
-
-    fn fill_buffers(&self, y: u16, buffers: &mut [Vec<u8>; 4]) {
-        let row = self.channels * usize::from(self.width);
-        let row = &self.pixels[usize::from(y) * row..][..row];
-        if self.channels == 1 {
-            buffers[0].extend_from_slice(row);
-        } else {
-            push_ycbcr(row, buffers);
-        }
-    }
-}
-
-/// Appends a row of RGB pixels in the encoder's color space.
-pub(crate) fn push_ycbcr(row: &[u8], [luma, blue, red, _]: &mut [Vec<u8>; 4]) {
-    for &[r, g, b] in row.as_chunks().0 {
-        let ycc = jpeg_encoder::rgb_to_ycbcr(r, g, b);
-        luma.push(ycc.0);
-        blue.push(ycc.1);
-        red.push(ycc.2);
-    }
-}
-
-/// Quality of JPEG files, 1 to 100.
-pub(crate) const JPEG_QUALITY: u8 = 95;
-
 /// What is not supported about other file names.
 pub(crate) const UNKNOWN_EXTENSION: &str = "an extension other than .png, .tif, .tiff, .jpg, .jpeg and .dzi";
-
-/// Writes a JPEG at quality 95.
-///
-/// # Errors
-/// As [`encode_jpeg`] and [`crate::write_atomic`].
-pub fn write_jpeg(path: impl AsRef<Path>, view: impl JpegPixels) -> Result<(), IoError> {
-    let path = path.as_ref();
-    write_bytes(path, &encode_jpeg(view, JPEG_QUALITY).map_err(|reason| IoError::writing(path, reason))?)
-}
 
 /// Encodes a TIFF file with Deflate compression; BigTIFF where it may exceed 4 GiB.
 ///
@@ -256,7 +145,7 @@ fn encode_tiff_parts((width, height, color, depth, bytes): Parts, metadata: &Met
 ///
 /// # Errors
 /// [`FormatError::Unsupported`] for another extension; [`FormatError::NotRepresentable`] for a JPEG of 16 bits or with alpha and for a Deep Zoom
-/// image of 16 bits; else as [`encode_png`], [`encode_tiff`], [`encode_jpeg`] and [`crate::write_atomic`].
+/// image of 16 bits; else as [`encode_png`], [`encode_tiff`], [`encode_jpeg`](crate::encode_jpeg) and [`crate::write_atomic`].
 pub fn write_image(path: impl AsRef<Path>, view: impl PngPixels, metadata: &Metadata) -> Result<(), IoError> {
     let path = path.as_ref();
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
@@ -270,13 +159,7 @@ pub fn write_image(path: impl AsRef<Path>, view: impl PngPixels, metadata: &Meta
     let bytes = match extension.as_deref() {
         Some("png") => encode_png_parts(parts, metadata, None),
         Some("tif" | "tiff") => encode_tiff_parts(parts, metadata),
-        Some("jpg" | "jpeg") if parts.3 == BitDepth::Eight && parts.2 != ColorType::Rgba => {
-            encode_jpeg_parts(parts, JPEG_QUALITY, metadata)
-        }
-        Some("jpg" | "jpeg") => {
-            let what = if parts.3 == BitDepth::Eight { "alpha" } else { "samples of 16 bits" };
-            Err(FormatError::NotRepresentable { format: "JPEG", what: what.to_owned() })
-        }
+        Some("jpg" | "jpeg") => encode_jpeg_parts(parts, JPEG_QUALITY, metadata),
         _ => Err(FormatError::unsupported("the file name", UNKNOWN_EXTENSION)),
     };
     write_bytes(path, &bytes.map_err(|reason| IoError::writing(path, reason))?)

@@ -1,7 +1,8 @@
 //! Writing Deep Zoom images: an XML file and a folder of tiles, from the whole image down to one pixel by factors of 2, of which viewers such as
 //! OpenSeadragon load what is visible. (Microsoft, "Deep Zoom File Format Overview".)
 
-use crate::encode::{encode_jpeg_parts, encode_png_parts};
+use crate::encode::encode_png_parts;
+use crate::encode_jpeg::encode_jpeg_parts;
 use crate::pending_writes::{PREFIX, PendingWrite, SUFFIX};
 use crate::{FormatError, IoError, Metadata};
 use png::{BitDepth, ColorType};

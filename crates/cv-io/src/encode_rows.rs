@@ -1,16 +1,15 @@
 //! Writing images row by row, without the whole image in memory.
 
-use crate::encode::{JPEG_QUALITY, Parts, PngPixels, UNKNOWN_EXTENSION, encode_jpeg_rows, png_writer, push_ycbcr};
+use crate::encode::{Parts, PngPixels, UNKNOWN_EXTENSION, png_writer};
 use crate::encode_dzi::DziWriter;
+use crate::encode_jpeg::{JPEG_QUALITY, JpegWriter};
 use crate::encode_tiff::{TiffLayout, TiffPosition, TiffWriter};
 use crate::files::write_atomic_file;
 use crate::{FormatError, IoError, Metadata};
-use jpeg_encoder::JpegColorType;
 use png::{BitDepth, ColorType};
 use std::fs::File;
-use std::io::{self, BufReader, BufWriter, Read, Seek, Write};
+use std::io::{self, BufWriter, Write};
 use std::path::Path;
-use std::sync::{Mutex, PoisonError};
 
 /// Bytes of compressed data per PNG chunk.
 const PNG_CHUNK_BYTES: usize = 1 << 18;
@@ -36,11 +35,7 @@ enum Encoder {
     Tiff(Box<TiffWriter<Sink>>),
     /// The file is written at the end, after the tiles.
     Dzi(Box<DziWriter>, File),
-    /// JPEG is encoded at the end, from the pixels in a temporary file.
-    Jpeg {
-        pixels: Sink,
-        file: File,
-    },
+    Jpeg(Box<JpegWriter<Sink>>),
 }
 
 fn png_error(error: png::EncodingError) -> FormatError {
@@ -87,7 +82,7 @@ impl RowWriter<'_> {
             Some(Encoder::Png(writer)) => Ok(writer.write_all(&bytes)?),
             Some(Encoder::Tiff(writer)) => writer.write(&bytes),
             Some(Encoder::Dzi(writer, _)) => writer.write(&bytes),
-            Some(Encoder::Jpeg { pixels, .. }) => Ok(pixels.write_all(&bytes)?),
+            Some(Encoder::Jpeg(writer)) => writer.write(&bytes),
             None => Ok(()),
         }
     }
@@ -121,15 +116,12 @@ impl RowWriter<'_> {
                 let writer = DziWriter::new(self.path, (width, height), (color, depth))?;
                 Ok(Encoder::Dzi(Box::new(writer), file))
             }
-            Some("jpg" | "jpeg") if depth == BitDepth::Eight && color == ColorType::Rgb => {
-                if width.max(height) > usize::from(u16::MAX) || width * height == 0 {
-                    return Err(too_large("JPEG"));
-                }
-                let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty());
-                let pixels = tempfile::tempfile_in(folder.unwrap_or(Path::new(".")))?;
-                Ok(Encoder::Jpeg { pixels: BufWriter::with_capacity(BUFFER_BYTES, pixels), file })
+            Some("jpg" | "jpeg") => {
+                let sink = BufWriter::with_capacity(BUFFER_BYTES, file);
+                let (size, pixels) = ((width, height), (color, depth));
+                let writer = JpegWriter::new(sink, size, pixels, JPEG_QUALITY, self.metadata.clone())?;
+                Ok(Encoder::Jpeg(Box::new(writer)))
             }
-            Some("jpg" | "jpeg") => Err(refused("JPEG", "anything but colors of 8 bits, row by row".to_owned())),
             _ => Err(FormatError::unsupported("the file name", UNKNOWN_EXTENSION)),
         }
     }
@@ -142,58 +134,9 @@ impl RowWriter<'_> {
             Some(Encoder::Png(writer)) => writer.finish().map_err(png_error),
             Some(Encoder::Tiff(writer)) => writer.finish(),
             Some(Encoder::Dzi(writer, mut file)) => Ok(file.write_all(writer.finish()?.as_bytes())?),
-            Some(Encoder::Jpeg { pixels, file }) => {
-                let (width, height) = self.size.unwrap_or_default();
-                let mut pixels = pixels.into_inner().map_err(io::IntoInnerError::into_error)?;
-                pixels.rewind()?;
-                let failure = Mutex::new(None);
-                let rows = SpooledRows {
-                    size: (width as u16, height as u16),
-                    pixels: Mutex::new((BufReader::with_capacity(BUFFER_BYTES, pixels), vec![0; 3 * width], None)),
-                    failure: &failure,
-                };
-                let mut sink = BufWriter::with_capacity(BUFFER_BYTES, file);
-                encode_jpeg_rows(&mut sink, rows, 3, JPEG_QUALITY, &self.metadata)?;
-                sink.flush()?;
-                failure.into_inner().unwrap_or_else(PoisonError::into_inner).map_or(Ok(()), |e| Err(FormatError::Os(e)))
-            }
+            Some(Encoder::Jpeg(writer)) => writer.finish(),
             None => Ok(()),
         }
-    }
-}
-
-/// RGB rows for the JPEG encoder, read from a file from the top.
-struct SpooledRows<'a> {
-    size: (u16, u16),
-    /// The file, the last row that was read, and its index.
-    pixels: Mutex<(BufReader<File>, Vec<u8>, Option<u16>)>,
-    failure: &'a Mutex<Option<io::Error>>,
-}
-
-impl jpeg_encoder::ImageBuffer for SpooledRows<'_> {
-    fn get_jpeg_color_type(&self) -> JpegColorType {
-        JpegColorType::Ycbcr
-    }
-
-    fn width(&self) -> u16 {
-        self.size.0
-    }
-
-    fn height(&self) -> u16 {
-        self.size.1
-    }
-
-    fn fill_buffers(&self, y: u16, buffers: &mut [Vec<u8>; 4]) {
-        let mut pixels = self.pixels.lock().unwrap_or_else(PoisonError::into_inner);
-        let (file, row, last) = &mut *pixels;
-        // Rows come in order; the last one is repeated to whole blocks.
-        if *last != Some(y) {
-            if let Err(error) = file.read_exact(row) {
-                self.failure.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
-            }
-            *last = Some(y);
-        }
-        push_ycbcr(row, buffers);
     }
 }
 

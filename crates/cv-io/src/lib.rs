@@ -42,6 +42,7 @@ mod depth_png;
 mod encode;
 mod encode_dzi;
 mod encode_exr;
+mod encode_jpeg;
 mod encode_rows;
 mod encode_tiff;
 mod error;
@@ -70,12 +71,10 @@ pub use camera::{
 };
 pub use camera_positions::{NamedPositions, parse_camera_positions, read_camera_positions};
 pub use depth_png::{depth_mm, kitti, scaled};
-pub use encode::{
-    JpegPixels, PngPixels, encode_jpeg, encode_png, encode_tiff, write_image, write_jpeg, write_png,
-    write_png_to_print, write_png_with,
-};
+pub use encode::{PngPixels, encode_png, encode_tiff, write_image, write_png, write_png_to_print, write_png_with};
 pub use encode_dzi::check_deep_zoom;
 pub use encode_exr::{encode_exr, write_exr};
+pub use encode_jpeg::{JpegPixels, encode_jpeg, write_jpeg};
 pub use encode_rows::{RowWriter, write_image_rows};
 pub use error::{FormatError, IoError};
 pub use exif_info::{ExifFocal, ExifGps, ExifInfo, FocalSource};
