@@ -1,8 +1,40 @@
-//! A pair of photographs at the bit depth of their files.
+//! Reading photographs: pairs at the bit depth of their files, and one while another is processed.
 
 use crate::frame::Failure;
-use cv_io::DynImage;
-use std::path::Path;
+use cv_io::{DynImage, IoError};
+use std::path::{Path, PathBuf};
+
+/// Reads two files in parallel; of two errors, the first one's is returned.
+pub(crate) fn read_both<'a, T: Send>(
+    [first, second]: [&'a Path; 2],
+    read: impl Fn(&'a Path) -> Result<T, IoError> + Sync,
+) -> Result<[T; 2], IoError> {
+    let (first, second) = rayon::join(|| read(first), || read(second));
+    Ok([first?, second?])
+}
+
+/// Photographs that are processed one after the other: the next one is read meanwhile.
+#[derive(Default)]
+pub(crate) struct ReadAhead {
+    next: Option<(PathBuf, Result<DynImage, IoError>)>,
+}
+
+impl ReadAhead {
+    /// Returns a photograph: that which was read ahead, if it is the same.
+    pub(crate) fn take(&mut self, path: &Path) -> Result<DynImage, IoError> {
+        match self.next.take() {
+            Some((ahead, image)) if ahead == path => image,
+            _ => cv_io::read_image(path),
+        }
+    }
+
+    /// Does `work` and reads the `next` photograph in parallel.
+    pub(crate) fn during<T: Send>(&mut self, next: Option<&Path>, work: impl FnOnce() -> T + Send) -> T {
+        let (done, next) = rayon::join(work, || next.map(|path| (path.to_owned(), cv_io::read_image(path))));
+        self.next = next;
+        done
+    }
+}
 
 /// A left and a right photograph.
 pub(crate) struct Photos {
@@ -12,7 +44,8 @@ pub(crate) struct Photos {
 
 impl Photos {
     pub(crate) fn read(left: &Path, right: &Path) -> Result<Self, Failure> {
-        Ok(Self { left: cv_io::read_image(left)?, right: cv_io::read_image(right)? })
+        let [left, right] = read_both([left, right], cv_io::read_image)?;
+        Ok(Self { left, right })
     }
 
     /// Width and height of each.

@@ -1,6 +1,7 @@
 //! `cv match`: tentative matches between two photographs.
 
 use crate::frame::{Context, Explain, Failure, Outcome, Output, Run, Step, TEXT, named, steps, two_images};
+use crate::photos::read_both;
 use crate::pictures::{Width, picture};
 use crate::words;
 use cv_core::{Keypoint, Named, RgbU8};
@@ -90,7 +91,7 @@ impl Run for Args {
         if let Some(ratio) = self.ratio.filter(|ratio| !(0.0..=1.0).contains(ratio)) {
             return Err(Failure::usage(format!("--ratio must be from 0 to 1, not {ratio}")));
         }
-        let (a, b) = (cv_io::read_rgb(&self.first)?, cv_io::read_rgb(&self.second)?);
+        let [a, b] = read_both([&self.first, &self.second], cv_io::read_rgb)?;
         let mut features = FeatureOptions::from(self.features);
         match &mut features {
             FeatureOptions::Harris(harris) => {

@@ -5,6 +5,7 @@ mod report;
 pub(crate) use report::sparse;
 
 use crate::frame::{CLOUD, Context, Failure, Outcome, Output, Run, Step, named, steps, two_images};
+use crate::photos::read_both;
 use crate::{rig, words};
 use cv_core::PointCloud;
 use cv_core::nalgebra::Matrix3;
@@ -110,7 +111,7 @@ impl Run for Args {
         if self.focal.is_some_and(|f| !(f > 0.0 && f.is_finite())) {
             return Err(Failure::usage("--focal must be positive"));
         }
-        let photos = [cv_io::read_image(&self.first)?, cv_io::read_image(&self.second)?];
+        let photos = read_both([&self.first, &self.second], cv_io::read_image)?;
         let (intrinsics, source) = self.intrinsics(&photos, context)?;
         context.note(&source);
         let mut options = ReconstructOptions::new(intrinsics);

@@ -12,6 +12,7 @@ mod places;
 mod report;
 
 use crate::frame::{CLOUD, Context, Failure, JSON, Outcome, Output, Run, Step, expand_images, named, steps};
+use crate::photos::ReadAhead;
 use crate::words;
 use cameras::Cameras;
 use checkpoint::{Checkpoint, Extracted};
@@ -164,7 +165,10 @@ impl Args {
         let mut clock = cv_core::StageClock::new();
         let (mut cameras, mut photos, mut used) = (Cameras::default(), Vec::new(), Vec::new());
         let total = all.len();
-        for (i, one) in all.iter_mut().enumerate() {
+        let mut ahead = ReadAhead::default();
+        for i in 0..total {
+            let next = all.get(i + 1).filter(|next| next.refused.is_none()).map(|next| next.path.clone());
+            let one = &mut all[i];
             if one.refused.is_none() {
                 let camera = |cameras: &mut Cameras, size, exif: Option<f64>| match inputs
                     .earlier
@@ -177,6 +181,7 @@ impl Args {
                 let place = PhotoProgress { progress: context, done: i, total };
                 match self.features_of(
                     one,
+                    (&mut ahead, next.as_deref()),
                     |size, exif| camera(&mut cameras, size, exif),
                     options,
                     checkpoint,
@@ -268,6 +273,7 @@ impl Args {
     fn features_of(
         &self,
         one: &mut Photograph,
+        ahead: (&mut ReadAhead, Option<&Path>),
         mut camera: impl FnMut((usize, usize), Option<f64>) -> Result<Result<usize, String>, Failure>,
         options: &SfmJobOptions,
         checkpoint: &Checkpoint<'_>,
@@ -278,7 +284,7 @@ impl Args {
         let new = stored.is_none();
         let extracted = match stored {
             Some(extracted) => extracted,
-            None => match self.extract(one, &mut camera, options, place)? {
+            None => match self.extract(one, ahead, &mut camera, options, place)? {
                 Ok(extracted) => extracted,
                 Err(reason) => return Ok(Err(reason)),
             },
@@ -295,15 +301,16 @@ impl Args {
         Ok(Ok(SfmPhoto { name: one.name.clone(), camera, ..extracted.photo }))
     }
 
-    /// Reads a photograph and extracts its features and metadata, or returns the reason why it is left out.
+    /// Reads a photograph and extracts its features and metadata, or returns the reason why it is left out. Reads the next one meanwhile.
     fn extract(
         &self,
         one: &Photograph,
+        (ahead, next): (&mut ReadAhead, Option<&Path>),
         mut camera: impl FnMut((usize, usize), Option<f64>) -> Result<Result<usize, String>, Failure>,
         options: &SfmJobOptions,
         place: &PhotoProgress<'_>,
     ) -> Result<Result<Extracted, String>, Failure> {
-        let image = match cv_io::read_image(&one.path) {
+        let image = match ahead.take(&one.path) {
             Ok(image) => image,
             Err(error) => return Ok(Err(words::many_views::not_read(&error))),
         };
@@ -313,7 +320,7 @@ impl Args {
             return Ok(Err(reason));
         }
         let rgb = image.into_rgb8();
-        match sfm_photo(rgb.view(), String::new(), 0, &options.features, place) {
+        match ahead.during(next, || sfm_photo(rgb.view(), String::new(), 0, &options.features, place)) {
             Ok(photo) => Ok(Ok(Extracted { focal, gps, photo })),
             Err(SfmPhotoError::Features(
                 error @ (FeatureError::ImageTooSmall { .. } | FeatureError::NotFinite { .. }),

@@ -3,7 +3,7 @@
 use crate::blend::NO_PHOTO;
 use crate::rows::{for_each_row, is_check_due};
 use crate::surface::{Bounds, WarpedPhoto};
-use cv_core::{Cancelled, Image, Stage};
+use cv_core::{Cancelled, Image, Stage, UnionFind};
 use cv_imgproc::GridCut;
 use cv_parallel::prelude::*;
 
@@ -83,9 +83,7 @@ where
         let Some(b) = own.bounds.intersection(&Bounds { left: 0, top: 0, right: width, bottom: height }) else {
             return Ok(Vec::new());
         };
-        let names = labels.as_slice();
-        let label_at = |x: usize, y: usize| names[y * width + x];
-        let differ = &self.difference;
+        let label_at = |x: usize, y: usize| labels.as_slice()[y * width + x];
         // Nodes: free pixels of other labels that alpha covers.
         let mut places: Vec<[u32; 2]> = Vec::new();
         for y in b.top..b.bottom {
@@ -105,9 +103,23 @@ where
                 }
             }
         }
-        if places.is_empty() {
-            return Ok(Vec::new());
-        }
+        // A cut does not depend on nodes that are not connected to it: of the other seams of the photograph.
+        let parts = connected_parts(&places);
+        let changed = parts.par_iter().map(|places| self.expand_part(labels, alpha, places, stage)).try_collect()?;
+        Ok(changed.concat())
+    }
+
+    /// Returns the indices of the pixels of a connected part of the nodes that the optimal expansion of `alpha` relabels.
+    fn expand_part(
+        &self,
+        labels: &Image<u16, 1>,
+        alpha: usize,
+        places: &[[u32; 2]],
+        stage: &Stage<'_>,
+    ) -> Result<Vec<usize>, Cancelled> {
+        let (width, height) = labels.size();
+        let label_at = |x: usize, y: usize| labels.as_slice()[y * width + x];
+        let differ = &self.difference;
         let place = |i: usize| (places[i][0] as usize, places[i][1] as usize);
         // Difference of alpha and the current label at each node: all that most edges, between pixels of one label, need.
         let mut shown = vec![0; places.len()];
@@ -117,7 +129,7 @@ where
                 *out = differ(alpha, usize::from(label_at(x, y)), x, y);
             }
         })?;
-        let mut cut = GridCut::new(&places, stage)?;
+        let mut cut = GridCut::new(places, stage)?;
         // Source side: keeps its label. Sink side: switches to alpha.
         for i in 0..places.len() {
             if i % NODES_PER_CHECK == 0 {
@@ -181,6 +193,35 @@ where
         let taken = (0..places.len()).filter(|&i| cut.is_on_sink_side(i));
         Ok(taken.map(|i| places[i][1] as usize * width + places[i][0] as usize).collect())
     }
+}
+
+/// Splits pixels (column, row) in row-major order into those that are connected along rows and columns, in the order of their first pixels.
+fn connected_parts(pixels: &[[u32; 2]]) -> Vec<Vec<[u32; 2]>> {
+    let mut sets = UnionFind::new(pixels.len());
+    // The first pixel that does not precede the lower neighbor in row-major order.
+    let mut below = 0;
+    for (i, &[x, y]) in pixels.iter().enumerate() {
+        if pixels.get(i + 1) == Some(&[x + 1, y]) {
+            sets.union(i as u32, i as u32 + 1);
+        }
+        while pixels.get(below).is_some_and(|&[u, v]| (v, u) < (y + 1, x)) {
+            below += 1;
+        }
+        if pixels.get(below) == Some(&[x, y + 1]) {
+            sets.union(i as u32, below as u32);
+        }
+    }
+    let mut parts: Vec<Vec<[u32; 2]>> = Vec::new();
+    let mut part_of = vec![usize::MAX; pixels.len()];
+    for (pixel, root) in pixels.iter().zip(sets.into_roots()) {
+        let part = &mut part_of[root as usize];
+        if *part == usize::MAX {
+            *part = parts.len();
+            parts.push(Vec::new());
+        }
+        parts[*part].push(*pixel);
+    }
+    parts
 }
 
 /// Returns whether the bounds of two photographs overlap or touch, also across the border of a canvas that spans 360°, of width `circle`.
@@ -309,6 +350,20 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn pixels_are_connected_along_rows_and_columns_only() {
+        // Rows of pixels: a U, whose ends are connected by its last row, one that touches it diagonally, and one apart.
+        let rows = ["x.x..", "x.x..", "xxx.x", "...x."];
+        let pixels: Vec<[u32; 2]> = (0..4)
+            .flat_map(|y| (0..5).map(move |x| [x, y]))
+            .filter(|&[x, y]| rows[y as usize].as_bytes()[x as usize] == b'x')
+            .collect();
+        let parts = connected_parts(&pixels);
+        let whole = [[0, 0], [2, 0], [0, 1], [2, 1], [0, 2], [1, 2], [2, 2]];
+        assert_eq!(parts, [whole.to_vec(), vec![[4, 2]], vec![[3, 3]]]);
+        assert!(connected_parts(&[]).is_empty());
     }
 
     #[test]

@@ -23,6 +23,7 @@ use alpha_expansion::{BeyondCost, Labeling};
 use contradiction::contradiction;
 use cost::difference;
 use cv_core::{Cancelled, Image, Progress, Stage, named};
+use cv_parallel::prelude::*;
 use misalignment::Misalignments;
 use transient::transient_costs;
 
@@ -241,7 +242,7 @@ fn refine_blocks(
     // Blocks whose middles there are.
     let (across, down) = ((w + BLOCK - 1 - MIDDLE) / BLOCK, (h + BLOCK - 1 - MIDDLE) / BLOCK);
     let before = Image::from_fn(across, down, |x, y| labels.at(BLOCK * x + MIDDLE, BLOCK * y + MIDDLE));
-    let subsampled: Vec<Option<WarpedPhoto>> = photos.iter().map(|photo| photo.map(subsampled)).collect();
+    let subsampled: Vec<Option<WarpedPhoto>> = photos.par_iter().map(|photo| photo.map(subsampled)).collect();
     let reached: Vec<Option<&WarpedPhoto>> = subsampled.iter().map(Option::as_ref).collect();
     let near = seam_band(&before, reach, stage)?;
     let differ = |a: usize, c: usize, x: usize, y: usize| block_difference(photos, a, c, x, y);
