@@ -29,7 +29,8 @@ pub(crate) fn upsample_rows<T: Sample>(
     let reaches = |label: u16, x: usize, y: usize| {
         photos.get(usize::from(label)).and_then(Option::as_ref).is_some_and(|p| p.reaches(x, y))
     };
-    let mut labels = Image::new(w, h, [NO_PHOTO]);
+    // Zeros are pages that the threads touch first.
+    let mut labels = Image::new(w, h, [0]);
     let (cw, ch) = coarse.size();
     // Interpolation index and weight of a canvas coordinate on the preview.
     let place = |v: usize, n: usize| {
@@ -41,6 +42,7 @@ pub(crate) fn upsample_rows<T: Sample>(
     // First canvas column of each preview column.
     let starts: Vec<usize> = (0..=cw).map(|i| columns.partition_point(|column| column.0 < i)).collect();
     for_each_row(labels.as_mut_slice(), w, stage, |y, row| {
+        row.fill(NO_PHOTO);
         let (y0, y1, fy) = place(top + y, ch);
         let (upper, lower) = (coarse.row(y0), coarse.row(y1));
         let vote = |x: usize| {
