@@ -62,6 +62,27 @@ pub struct GridCut {
     clock: u32,
 }
 
+/// Calls `visit` with the index of each of distinct `pixels` (column, row), given in row-major order, and the indices of the pixels right of it and below, if they are among them.
+///
+/// # Errors
+/// The first of `visit`.
+#[inline]
+pub fn grid_neighbors<E>(
+    pixels: &[[u32; 2]],
+    mut visit: impl FnMut(usize, Option<usize>, Option<usize>) -> Result<(), E>,
+) -> Result<(), E> {
+    // The first pixel that does not precede the lower neighbor in row-major order.
+    let mut below = 0;
+    for (i, &[x, y]) in pixels.iter().enumerate() {
+        while pixels.get(below).is_some_and(|&[u, v]| (v, u) < (y + 1, x)) {
+            below += 1;
+        }
+        let neighbor = |j: usize, at: [u32; 2]| (pixels.get(j) == Some(&at)).then_some(j);
+        visit(i, neighbor(i + 1, [x + 1, y]), neighbor(below, [x, y + 1]))?;
+    }
+    Ok(())
+}
+
 impl GridCut {
     /// Builds the graph of distinct `pixels` (column, row), given in row-major order.
     ///
@@ -72,24 +93,18 @@ impl GridCut {
         let mut cut = Self::default();
         cut.clear(pixels.len());
         let nodes = &mut cut.nodes;
-        // The first pixel that does not precede the lower neighbor in row-major order.
-        let mut below = 0;
-        for (i, &[x, y]) in pixels.iter().enumerate() {
+        grid_neighbors(pixels, |i, right, below| {
             if i % (1 << 20) == 0 {
                 stage.check()?;
             }
-            if pixels.get(i + 1) == Some(&[x + 1, y]) {
-                nodes[i].neighbor[RIGHT] = i as u32 + 1;
-                nodes[i + 1].neighbor[RIGHT + 1] = i as u32;
+            for (direction, other) in [(RIGHT, right), (DOWN, below)] {
+                if let Some(other) = other {
+                    nodes[i].neighbor[direction] = other as u32;
+                    nodes[other].neighbor[direction + 1] = i as u32;
+                }
             }
-            while pixels.get(below).is_some_and(|&[u, v]| (v, u) < (y + 1, x)) {
-                below += 1;
-            }
-            if pixels.get(below) == Some(&[x, y + 1]) {
-                nodes[i].neighbor[DOWN] = below as u32;
-                nodes[below].neighbor[DOWN + 1] = i as u32;
-            }
-        }
+            Ok(())
+        })?;
         Ok(cut)
     }
 

@@ -52,7 +52,7 @@ pub use connected_components::{
     remove_small_components,
 };
 pub use gaussian::{gaussian_blur, gaussian_half_kernel, separable_symmetric, sobel};
-pub use grid_cut::GridCut;
+pub use grid_cut::{GridCut, grid_neighbors};
 pub use integral_image::{IntegralImage, box_filter};
 pub use median::{median_filter_3x3, median_filter_5x5};
 pub use mirror::{mirror_ends, mirror_index};

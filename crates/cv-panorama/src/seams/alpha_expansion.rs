@@ -4,7 +4,7 @@ use crate::blend::NO_PHOTO;
 use crate::rows::{for_each_row, is_check_due};
 use crate::surface::{Bounds, WarpedPhoto};
 use cv_core::{Cancelled, Image, Stage, UnionFind};
-use cv_imgproc::GridCut;
+use cv_imgproc::{GridCut, grid_neighbors};
 use cv_parallel::prelude::*;
 
 /// Smoothness cost per unit of seam length.
@@ -104,7 +104,7 @@ where
             }
         }
         // A cut does not depend on nodes that are not connected to it: of the other seams of the photograph.
-        let parts = connected_parts(&places);
+        let parts = connected_parts(&places, stage)?;
         let changed = parts.par_iter().map(|places| self.expand_part(labels, alpha, places, stage)).try_collect()?;
         Ok(changed.concat())
     }
@@ -155,6 +155,7 @@ where
                 let switch = if q == alpha { 0 } else { LENGTH_COST + here + differ(alpha, q, nx, ny) };
                 add_signed(&mut cut, i, switch - keep);
             }
+            // As of a fixed neighbor, although it may be a node, too, of a photograph placed on both sides at once (around a pole).
             if let Some(beyond) = self.beyond.filter(|_| x == 0 || x + 1 == width) {
                 let q = label_at(width - 1 - x, y);
                 if q != NO_PHOTO {
@@ -196,21 +197,17 @@ where
 }
 
 /// Splits pixels (column, row) in row-major order into those that are connected along rows and columns, in the order of their first pixels.
-fn connected_parts(pixels: &[[u32; 2]]) -> Vec<Vec<[u32; 2]>> {
+fn connected_parts(pixels: &[[u32; 2]], stage: &Stage<'_>) -> Result<Vec<Vec<[u32; 2]>>, Cancelled> {
     let mut sets = UnionFind::new(pixels.len());
-    // The first pixel that does not precede the lower neighbor in row-major order.
-    let mut below = 0;
-    for (i, &[x, y]) in pixels.iter().enumerate() {
-        if pixels.get(i + 1) == Some(&[x + 1, y]) {
-            sets.union(i as u32, i as u32 + 1);
+    grid_neighbors(pixels, |i, right, below| {
+        if i % NODES_PER_CHECK == 0 {
+            stage.check()?;
         }
-        while pixels.get(below).is_some_and(|&[u, v]| (v, u) < (y + 1, x)) {
-            below += 1;
-        }
-        if pixels.get(below) == Some(&[x, y + 1]) {
-            sets.union(i as u32, below as u32);
-        }
-    }
+        [right, below].into_iter().flatten().for_each(|other| {
+            sets.union(i as u32, other as u32);
+        });
+        Ok(())
+    })?;
     let mut parts: Vec<Vec<[u32; 2]>> = Vec::new();
     let mut part_of = vec![usize::MAX; pixels.len()];
     for (pixel, root) in pixels.iter().zip(sets.into_roots()) {
@@ -221,7 +218,7 @@ fn connected_parts(pixels: &[[u32; 2]]) -> Vec<Vec<[u32; 2]>> {
         }
         parts[*part].push(*pixel);
     }
-    parts
+    Ok(parts)
 }
 
 /// Returns whether the bounds of two photographs overlap or touch, also across the border of a canvas that spans 360°, of width `circle`.
@@ -360,10 +357,10 @@ mod tests {
             .flat_map(|y| (0..5).map(move |x| [x, y]))
             .filter(|&[x, y]| rows[y as usize].as_bytes()[x as usize] == b'x')
             .collect();
-        let parts = connected_parts(&pixels);
+        let parts = connected_parts(&pixels, &stage()).unwrap();
         let whole = [[0, 0], [2, 0], [0, 1], [2, 1], [0, 2], [1, 2], [2, 2]];
         assert_eq!(parts, [whole.to_vec(), vec![[4, 2]], vec![[3, 3]]]);
-        assert!(connected_parts(&[]).is_empty());
+        assert!(connected_parts(&[], &stage()).unwrap().is_empty());
     }
 
     #[test]
