@@ -1,6 +1,7 @@
-//! Large blocks: anonymous mappings with transparent huge pages.
+//! Large blocks: anonymous mappings with transparent huge pages, of which some are kept when they are freed.
 
-use std::ptr::null_mut;
+use crate::spare::{self, Spare};
+use std::ptr::{null_mut, with_exposed_provenance_mut};
 
 /// Size of a huge page on x86-64, and on AArch64 with pages of 4 KiB.
 const HUGE_PAGE: usize = 2 << 20;
@@ -14,9 +15,24 @@ fn capacity_of(size: usize) -> Option<usize> {
     if huge - size <= HUGE_PAGE / 2 { Some(huge) } else { size.checked_next_multiple_of(PAGE) }
 }
 
-/// Maps a block of at least `size` bytes, all zero and aligned to pages; null where there is no memory.
-pub(crate) fn map(size: usize) -> *mut u8 {
+/// Returns a block of at least `size` bytes, aligned to pages; null where there is no memory.
+pub(crate) fn block(size: usize) -> *mut u8 {
     let Some(capacity) = capacity_of(size) else { return null_mut() };
+    spare::take(capacity).map_or_else(|| map(capacity), |spare| with_exposed_provenance_mut(spare.address))
+}
+
+/// As [`block`], all zero.
+pub(crate) fn zeroed_block(size: usize) -> *mut u8 {
+    let Some(capacity) = capacity_of(size) else { return null_mut() };
+    let Some(spare) = spare::take(capacity) else { return map(capacity) };
+    let block: *mut u8 = with_exposed_provenance_mut(spare.address);
+    // SAFETY: the spare block is a mapping of this capacity that nothing uses.
+    unsafe { block.write_bytes(0, size) };
+    block
+}
+
+/// Maps a block, all zero and aligned to pages; null where there is no memory.
+fn map(capacity: usize) -> *mut u8 {
     // The system aligns to small pages: one huge page more, whose surplus is unmapped.
     let Some(reserved) = capacity.checked_add(HUGE_PAGE) else { return null_mut() };
     let (access, kind) = (libc::PROT_READ | libc::PROT_WRITE, libc::MAP_PRIVATE | libc::MAP_ANONYMOUS);
@@ -38,21 +54,23 @@ pub(crate) fn map(size: usize) -> *mut u8 {
     }
 }
 
-/// Unmaps a block.
+/// Frees a block.
 ///
 /// # Safety
-/// `block` is from [`map`] or [`remap`], for this size, and not used any more.
-pub(crate) unsafe fn unmap(block: *mut u8, size: usize) {
+/// `block` is from [`block`], [`zeroed_block`] or [`remap`], for this size, and not used any more.
+pub(crate) unsafe fn free(block: *mut u8, size: usize) {
     if let Some(capacity) = capacity_of(size) {
-        // SAFETY: the block is a mapping of this capacity, which the caller does not use any more.
-        unsafe { release(block, capacity) };
+        spare::put(Spare { address: block.expose_provenance(), capacity }, |spare| {
+            // SAFETY: the block is a mapping of its capacity, the caller's or a spare one, which nothing uses any more.
+            unsafe { release(with_exposed_provenance_mut(spare.address), spare.capacity) };
+        });
     }
 }
 
 /// Changes the size of a block, whose pages may be mapped elsewhere then but are not copied. Null where there is no memory; the block stays as it was then.
 ///
 /// # Safety
-/// As for [`unmap`].
+/// As for [`free`].
 pub(crate) unsafe fn remap(block: *mut u8, size: usize, new_size: usize) -> *mut u8 {
     let (Some(capacity), Some(new_capacity)) = (capacity_of(size), capacity_of(new_size)) else { return null_mut() };
     if capacity == new_capacity {

@@ -1,8 +1,8 @@
 //! Global allocator for programs that process images.
 //!
 //! Image buffers are large and short-lived. The system's allocator maps them at allocation and unmaps them when they are freed, and the kernel then maps each page of 4 KiB at its first
-//! use: a page fault, which costs more than to fill the page. On Linux, [`ImageAllocator`] maps blocks from [`LARGE`] on with transparent huge pages of 2 MiB. Smaller blocks, and all
-//! blocks on other systems, are those of the system's allocator.
+//! use: a page fault, which costs more than to fill the page. On Linux, [`ImageAllocator`] maps blocks from [`LARGE`] on with transparent huge pages of 2 MiB, and keeps up to 16 MiB of
+//! freed ones for new blocks of the same size. Smaller blocks, and all blocks on other systems, are those of the system's allocator.
 //!
 //! ```
 //! #[global_allocator]
@@ -16,6 +16,8 @@
 
 #[cfg(target_os = "linux")]
 mod large;
+#[cfg(target_os = "linux")]
+mod spare;
 
 use std::alloc::{GlobalAlloc, Layout, System};
 
@@ -33,12 +35,12 @@ fn is_large(layout: Layout) -> bool {
 }
 
 // SAFETY: Small blocks are those of `System`. Large ones are mappings, at least as large as the layout and aligned to pages. Which of the two a block is depends on its layout alone.
-// Nothing panics.
+// Nothing panics, and the list of spare mappings allocates nothing.
 unsafe impl GlobalAlloc for ImageAllocator {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         #[cfg(target_os = "linux")]
         if is_large(layout) {
-            return large::map(layout.size());
+            return large::block(layout.size());
         }
         // SAFETY: the caller's.
         unsafe { System.alloc(layout) }
@@ -47,8 +49,7 @@ unsafe impl GlobalAlloc for ImageAllocator {
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         #[cfg(target_os = "linux")]
         if is_large(layout) {
-            // New mappings are zero.
-            return large::map(layout.size());
+            return large::zeroed_block(layout.size());
         }
         // SAFETY: the caller's.
         unsafe { System.alloc_zeroed(layout) }
@@ -57,8 +58,8 @@ unsafe impl GlobalAlloc for ImageAllocator {
     unsafe fn dealloc(&self, block: *mut u8, layout: Layout) {
         #[cfg(target_os = "linux")]
         if is_large(layout) {
-            // SAFETY: by its layout, the block is from `large::map` or `large::remap`, for this size.
-            return unsafe { large::unmap(block, layout.size()) };
+            // SAFETY: by its layout, the block is from `large::block`, `large::zeroed_block` or `large::remap`, for this size.
+            return unsafe { large::free(block, layout.size()) };
         }
         // SAFETY: the caller's; by its layout, the block is from `System`.
         unsafe { System.dealloc(block, layout) }
@@ -71,7 +72,7 @@ unsafe impl GlobalAlloc for ImageAllocator {
             // SAFETY: the caller's; by both layouts, the block is from `System` and stays there.
             (false, false) => unsafe { System.realloc(block, layout, new_size) },
             #[cfg(target_os = "linux")]
-            // SAFETY: by its layout, the block is from `large::map` or `large::remap`, for this size.
+            // SAFETY: by its layout, the block is from `large::block`, `large::zeroed_block` or `large::remap`, for this size.
             (true, true) => unsafe { large::remap(block, layout.size(), new_size) },
             _ => {
                 // SAFETY: the new layout is not empty: the caller guarantees that `new_size` is not 0.
