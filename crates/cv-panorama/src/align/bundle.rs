@@ -8,8 +8,7 @@
 use cv_core::Distortion;
 use cv_numeric::RobustLoss;
 use cv_numeric::adjust::{
-    AdjustError, AdjustOptions, AdjustReport, Adjustment, Euclidean, GroupId, Manifold, Prior, Residual,
-    RotationManifold,
+    AdjustError, AdjustOptions, AdjustReport, Adjustment, GroupId, Manifold, Prior, Residual, RotationManifold,
 };
 use nalgebra::{Matrix3, SMatrix, Vector2, Vector3};
 use std::ops::ControlFlow;
@@ -39,6 +38,29 @@ impl Manifold for HomographyManifold {
         let change = Matrix3::from_fn(|i, j| delta.get(3 * i + j).copied().unwrap_or(0.0));
         let to = (Matrix3::identity() + change) * Matrix3::from_column_slice(x);
         moved.copy_from_slice((to / to.norm()).as_slice());
+    }
+}
+
+/// Intrinsics as log focal length, k₁ and focal length: the exponential is computed once per step instead of in every residual.
+struct LensManifold;
+
+impl LensManifold {
+    fn numbers(lens: &Lens) -> [f64; 3] {
+        [lens.log_focal, lens.k1, lens.log_focal.exp()]
+    }
+}
+
+impl Manifold for LensManifold {
+    fn ambient(&self) -> usize {
+        3
+    }
+
+    fn tangent(&self) -> usize {
+        2
+    }
+
+    fn step(&self, x: &[f64], delta: &[f64], moved: &mut [f64]) {
+        moved.copy_from_slice(&Self::numbers(&Lens { log_focal: x[0] + delta[0], k1: x[1] + delta[1] }));
     }
 }
 
@@ -166,13 +188,13 @@ impl<const M: usize, const C: usize> Residual<2, 4, C> for Transfers<M, C> {
         jacobian: Option<&mut SMatrix<f64, 2, C>>,
     ) -> Option<Vector2<f64>> {
         let (a, b) = self.matches[item];
+        let (from_focal, f) = (from[2], to[2]);
         let [from, to] = [from, to].map(|l| Lens { log_focal: l[0], k1: l[1] });
         let relative = Matrix3::from_column_slice(target) * inverse(self.kind, &Matrix3::from_column_slice(source));
         let invalid = Some(Vector2::new(INVALID_RESIDUAL_PX, 0.0));
-        let Some(p) = from.normalize(a / from.log_focal.exp()) else { return invalid };
+        let Some(p) = from.normalize(a / from_focal) else { return invalid };
         let x = p.push(1.0);
         let y = relative * x;
-        let f = to.log_focal.exp();
         let Some((n, factor)) = project(&y, to) else { return invalid };
         let projected = n * (factor * f);
         let Some(j) = jacobian else { return Some(projected - b) };
@@ -257,8 +279,8 @@ impl Problem<'_> {
     fn adjust(&self, state: &mut State, limits: Limits) -> Result<AdjustReport, AdjustError> {
         let mut problem = Adjustment::default();
         let numbers = state.motion.iter().flat_map(|m| m.iter().copied()).collect();
-        let lenses = state.lenses.iter().flat_map(|l| [l.log_focal, l.k1]).collect();
-        let lenses = problem.add_group("lenses", Euclidean(2), lenses)?;
+        let lenses = state.lenses.iter().flat_map(LensManifold::numbers).collect();
+        let lenses = problem.add_group("lenses", LensManifold, lenses)?;
         let motions = match self.kind {
             Motion::Rotation => {
                 let motions = problem.add_group("rotations", RotationManifold, numbers)?;
@@ -293,7 +315,7 @@ impl Problem<'_> {
         for (motion, x) in state.motion.iter_mut().zip(problem.values(motions).chunks_exact(9)) {
             motion.copy_from_slice(x);
         }
-        for (lens, x) in state.lenses.iter_mut().zip(problem.values(lenses).chunks_exact(2)) {
+        for (lens, x) in state.lenses.iter_mut().zip(problem.values(lenses).chunks_exact(3)) {
             (lens.log_focal, lens.k1) = (x[0], x[1]);
         }
         Ok(report)
@@ -374,7 +396,7 @@ mod tests {
         manifold: &impl Manifold,
         motions: [Matrix3<f64>; 2],
     ) {
-        let lenses = [[6.5, -0.04], [6.6, 0.03]];
+        let lenses = [(6.5, -0.04), (6.6, 0.03)].map(|(log_focal, k1)| LensManifold::numbers(&Lens { log_focal, k1 }));
         let at = |item: usize, c: usize, h: f64| {
             let (mut motions, mut lenses) = (motions, lenses);
             if c < 2 * M {
@@ -383,7 +405,10 @@ mod tests {
                 let before = motions[c / M];
                 manifold.step(before.as_slice(), &delta[..M], motions[c / M].as_mut_slice());
             } else {
-                lenses[(c - 2 * M) / 2][(c - 2 * M) % 2] += h;
+                let mut delta = [0.0; 2];
+                delta[(c - 2 * M) % 2] = h;
+                let before = lenses[(c - 2 * M) / 2];
+                LensManifold.step(&before, &delta, &mut lenses[(c - 2 * M) / 2]);
             }
             let blocks = [motions[0].as_slice(), motions[1].as_slice(), &lenses[0], &lenses[1]];
             transfers.evaluate(item, blocks, None).unwrap()

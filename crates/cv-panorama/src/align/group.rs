@@ -185,7 +185,6 @@ impl<'a> Group<'a> {
         stage: &Stage<'_>,
     ) -> Result<(Solution, CameraMotion), Cancelled> {
         let rotation = (options.motion != CameraMotion::Homography).then(|| self.solve_rotation(options, stage));
-        let flat = || self.solve_homography(options, stage);
         Ok(match (options.motion, rotation.transpose()?) {
             (CameraMotion::Auto, Some(rotation)) => {
                 let typical = self.median_error(CameraMotion::Rotation, &rotation);
@@ -193,17 +192,18 @@ impl<'a> Group<'a> {
                 if typical <= GOOD_FIT * options.outlier_px {
                     return Ok((rotation, CameraMotion::Rotation));
                 }
-                let flat = flat()?;
                 // Model selection: the homography model has five more unknowns per photograph and must fit far better.
-                let better = self.median_error(CameraMotion::Homography, &flat) < 0.4 * typical;
-                if better && self.in_front(&flat) {
-                    (flat, CameraMotion::Homography)
-                } else {
-                    (rotation, CameraMotion::Rotation)
+                let flat = self.solve_homography(options, Limits::SELECTION, stage)?;
+                if self.median_error(CameraMotion::Homography, &flat) < 0.4 * typical {
+                    let flat = self.solve_homography(options, Limits::RESULT, stage)?;
+                    if self.in_front(&flat) {
+                        return Ok((flat, CameraMotion::Homography));
+                    }
                 }
+                (rotation, CameraMotion::Rotation)
             }
             (_, Some(rotation)) => (rotation, CameraMotion::Rotation),
-            (_, None) => (flat()?, CameraMotion::Homography),
+            (_, None) => (self.solve_homography(options, Limits::RESULT, stage)?, CameraMotion::Homography),
         })
     }
 
@@ -271,7 +271,12 @@ impl<'a> Group<'a> {
         Ok(Solution { lens_of, prior, state })
     }
 
-    fn solve_homography(&self, options: &AlignOptions, stage: &Stage<'_>) -> Result<Solution, Cancelled> {
+    fn solve_homography(
+        &self,
+        options: &AlignOptions,
+        limits: Limits,
+        stage: &Stage<'_>,
+    ) -> Result<Solution, Cancelled> {
         let (lens_of, representatives) = self.lenses();
         let prior = self.focal_guesses(&representatives);
         // The homographies absorb the focal length; only the metric frame depends on it.
@@ -286,7 +291,7 @@ impl<'a> Group<'a> {
         let (state, _) = wide.solve(State { motion, lenses }, Limits::START);
         stage.check()?;
         let problem = self.problem(Motion::Homography, &lens_of, &prior, options.outlier_px);
-        let (state, _) = problem.solve(state, Limits::RESULT);
+        let (state, _) = problem.solve(state, limits);
         Ok(Solution { lens_of, prior, state })
     }
 
