@@ -71,7 +71,7 @@ where
         Ok(())
     }
 
-    /// Returns the indices of the pixels that the optimal expansion of `alpha` relabels.
+    /// Returns the indices of the pixels that the optimal expansion of `alpha` relabels, in ascending order.
     pub(super) fn expand_one(
         &self,
         labels: &Image<u16, 1>,
@@ -106,7 +106,10 @@ where
         // A cut does not depend on nodes that are not connected to it: of the other seams of the photograph.
         let parts = connected_parts(&places, stage)?;
         let changed = parts.par_iter().map(|places| self.expand_part(labels, alpha, places, stage)).try_collect()?;
-        Ok(changed.concat())
+        let mut changed: Vec<usize> = changed.concat();
+        // Several parts may extend over the same rows.
+        changed.sort_unstable();
+        Ok(changed)
     }
 
     /// Returns the indices of the pixels of a connected part of the nodes that the optimal expansion of `alpha` relabels.
@@ -361,6 +364,23 @@ mod tests {
         let whole = [[0, 0], [2, 0], [0, 1], [2, 1], [0, 2], [1, 2], [2, 2]];
         assert_eq!(parts, [whole.to_vec(), vec![[4, 2]], vec![[3, 3]]]);
         assert!(connected_parts(&[], &stage()).unwrap().is_empty());
+    }
+
+    #[test]
+    fn relabeled_pixels_of_several_parts_are_in_row_major_order() {
+        // Two parts that take the other label: the second begins in the last row of the first, on its left.
+        let rows = ["..xx", "x.x.", "x..."];
+        let free: Vec<bool> = rows.iter().flat_map(|row| row.bytes().map(|b| b == b'x')).collect();
+        let photo = drawn(Bounds { left: 0, top: 0, right: 4, bottom: 3 }, |_, _| [0; 3]);
+        let labeling = Labeling {
+            photos: &[Some(&photo), Some(&photo)],
+            unary: |label, _, _| if label == 0 { 1000 } else { 0 },
+            difference: |_, _, _, _| 0,
+            free: |y: usize| &free[4 * y..4 * y + 4],
+            beyond: None,
+        };
+        let changed = labeling.expand_one(&Image::new(4, 3, [0]), 1, &stage()).unwrap();
+        assert_eq!(changed, [2, 3, 4, 6, 8]);
     }
 
     #[test]
