@@ -6,15 +6,14 @@ use cv_alloc::{ImageAllocator, LARGE};
 #[global_allocator]
 static ALLOCATOR: ImageAllocator = ImageAllocator;
 
-/// Resident memory of this process in MiB.
-fn resident() -> usize {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap();
-    let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
-    line.split_whitespace().nth(1).unwrap().parse::<usize>().unwrap() / 1024
-}
-
 #[test]
 fn freed_memory_is_given_back() {
+    // Resident memory of this process in MiB.
+    let resident = || {
+        let status = std::fs::read_to_string("/proc/self/status").unwrap();
+        let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse::<usize>().unwrap() / 1024
+    };
     let before = resident();
     let blocks: Vec<Vec<u8>> = (0..10).map(|_| vec![1; 60 * LARGE]).collect();
     assert!(resident() >= before + 600 * LARGE / (1 << 20), "{} {before}", resident());

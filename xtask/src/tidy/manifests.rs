@@ -6,6 +6,9 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 use std::{collections::BTreeMap, fs, path::Path};
 
+/// The lowest tier of programs; crates below are libraries.
+const FIRST_PROGRAM_TIER: u8 = 5;
+
 /// The top-level keys and values of a TOML file.
 pub(super) type Table = Map<String, Value>;
 
@@ -92,6 +95,12 @@ pub(super) fn check_manifest(
             if !inherits(Some(value)) {
                 found.problems.push(format!("{name}: {dependency} names its own version, not the workspace's"));
             }
+            if !dev && rule.tier < FIRST_PROGRAM_TIER && selects_features(value) {
+                found.problems.push(format!(
+                    "{name}: {dependency} with features of its own: name them in the workspace's dependencies, so that the libraries \
+                     build alone as they do together"
+                ));
+            }
             if rules.crates.contains_key(dependency) {
                 let allowed = rule.uses.iter().any(|used| used == dependency || used == "*");
                 // Ground truth for tests; cv-synth itself depends only on cv-core, so there is no cycle.
@@ -129,6 +138,11 @@ pub(super) fn check_manifest(
         found.problems.push(format!("{name}: no `mod` leads to {orphan}, so it is never compiled"));
     }
     Ok(())
+}
+
+/// Returns whether a dependency enables or disables features beside those of the workspace's definition.
+fn selects_features(dependency: &Value) -> bool {
+    ["features", "default-features"].iter().any(|key| dependency.get(key).is_some())
 }
 
 /// Returns the text of a Rust file, or of all Rust files in a folder; empty if there is none.
@@ -189,6 +203,20 @@ fn orphans(folder: &Path) -> Result<Vec<String>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_dependency_with_features_of_its_own_is_found() {
+        let manifest: Table = basic_toml::from_str(
+            "plain.workspace = true\n\
+             optional = { workspace = true, optional = true }\n\
+             more = { workspace = true, features = [\"std\"] }\n\
+             less = { workspace = true, default-features = false }",
+        )
+        .unwrap();
+        let found: Vec<_> =
+            manifest.iter().filter(|(_, value)| selects_features(value)).map(|(name, _)| name.as_str()).collect();
+        assert_eq!(found, ["less", "more"]);
+    }
 
     #[test]
     fn a_name_inside_another_is_not_a_use() {
