@@ -5,11 +5,12 @@
 
 mod support;
 
-use cv_core::{Mask, RgbU8};
+use cv_core::Mask;
 use std::{
     fs,
     path::Path,
     process::{Child, Command, Output, Stdio},
+    sync::LazyLock,
     thread::sleep,
     time::{Duration, Instant},
 };
@@ -18,28 +19,42 @@ use support::{cv, snapshot};
 /// The target is 200 ms on an idle machine; tests run beside others, up to ten per core.
 const SOON: Duration = Duration::from_secs(2);
 
-/// Texture without repetition.
-fn texture(x: usize, y: usize) -> u8 {
-    let cell = |size: usize| {
+/// Width and height of [`TEXTURE`].
+const TEXTURE_SIZE: (usize, usize) = (2400, 1800);
+
+/// A texture without repetition. Computed once, and repeated in larger images: the tests of the program are not optimized.
+static TEXTURE: LazyLock<Vec<u8>> = LazyLock::new(|| {
+    let cell = |x: usize, y: usize, size: usize| {
         let mut v =
             ((x / size) as u32).wrapping_mul(0x9E37_79B9) ^ ((y / size + size) as u32).wrapping_mul(0x85EB_CA6B);
         v = (v ^ (v >> 15)).wrapping_mul(0x2C1B_3C6D);
         ((v ^ (v >> 12)) >> 24) as u8
     };
-    [3, 7, 17].map(|size| cell(size) / 3).iter().sum()
+    let (width, height) = TEXTURE_SIZE;
+    let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+    pixels.map(|(x, y)| cell(x, y, 3) / 3 + cell(x, y, 7) / 3 + cell(x, y, 17) / 3).collect()
+});
+
+/// Returns the texture's row for row `y` of an image, from column `shift` on and around its end.
+fn texture_row(y: usize, shift: usize) -> impl Iterator<Item = u8> {
+    let (width, height) = TEXTURE_SIZE;
+    let row = &TEXTURE[y % height * width..][..width];
+    row.iter().copied().cycle().skip(shift)
 }
 
 /// Two images of a textured wall, shifted by `shift` pixels, and a mask.
 fn write_inputs(folder: &Path, (width, height): (usize, usize), shift: usize) {
     for (name, shift) in [("left.ppm", 0), ("right.ppm", shift)] {
-        let image = RgbU8::from_fn(width, height, |x, y| [texture(x + shift, y), texture(y, x + shift), 90]);
         let mut ppm = format!("P6\n{width} {height}\n255\n").into_bytes();
-        ppm.extend_from_slice(image.as_slice());
+        for y in 0..height {
+            let pixels = texture_row(y, shift).zip(texture_row(y + 900, shift)).take(width);
+            ppm.extend(pixels.flat_map(|(red, green)| [red, green, 90]));
+        }
         fs::write(folder.join(name), ppm).unwrap();
     }
     fs::create_dir_all(folder.join("masks")).unwrap();
-    let mask = Mask::from_fn(width, height, |x, y| [texture(x, y) > 150]);
-    cv_io::write_png(folder.join("masks/left.png"), mask.view()).unwrap();
+    let mask = (0..height).flat_map(|y| texture_row(y, 0).take(width).map(|v| v > 150)).collect();
+    cv_io::write_png(folder.join("masks/left.png"), Mask::from_vec(width, height, mask).unwrap().view()).unwrap();
 }
 
 const RIG: &str = "schema: cv-rig/1\nunit: m\n\
