@@ -22,7 +22,7 @@ const SOON: Duration = Duration::from_secs(2);
 /// Width and height of [`TEXTURE`].
 const TEXTURE_SIZE: (usize, usize) = (2400, 1800);
 
-/// A texture without repetition. Computed once, and repeated in larger images: the tests of the program are not optimized.
+/// A gray texture without repetition. Computed once, and repeated by rows in larger images: the tests of the program are not optimized.
 static TEXTURE: LazyLock<Vec<u8>> = LazyLock::new(|| {
     let cell = |x: usize, y: usize, size: usize| {
         let mut v =
@@ -35,26 +35,38 @@ static TEXTURE: LazyLock<Vec<u8>> = LazyLock::new(|| {
     pixels.map(|(x, y)| cell(x, y, 3) / 3 + cell(x, y, 7) / 3 + cell(x, y, 17) / 3).collect()
 });
 
-/// Returns the texture's row for row `y` of an image, from column `shift` on and around its end.
-fn texture_row(y: usize, shift: usize) -> impl Iterator<Item = u8> {
-    let (width, height) = TEXTURE_SIZE;
-    let row = &TEXTURE[y % height * width..][..width];
-    row.iter().copied().cycle().skip(shift)
+/// Returns the interleaved colors of an image whose rows are those of the texture from column `shift` on and around its end.
+fn repeat_texture((width, height): (usize, usize), shift: usize, color: impl Fn(u8) -> [u8; 3]) -> Vec<u8> {
+    let (columns, rows) = TEXTURE_SIZE;
+    let texture: Vec<Vec<u8>> = (TEXTURE.chunks(columns).take(height))
+        .map(|row| {
+            let mut row: Vec<u8> = row.iter().flat_map(|v| color(*v)).collect();
+            row.rotate_left(3 * shift);
+            row
+        })
+        .collect();
+    let mut values = Vec::with_capacity(3 * width * height);
+    for y in 0..height {
+        while values.len() < 3 * width * (y + 1) {
+            values.extend_from_slice(&texture[y % rows]);
+        }
+        values.truncate(3 * width * (y + 1));
+    }
+    values
 }
 
-/// Two images of a textured wall, shifted by `shift` pixels, and a mask.
-fn write_inputs(folder: &Path, (width, height): (usize, usize), shift: usize) {
+/// Two images of a textured wall, shifted by `shift` pixels, and a mask. The contrast is divided by `faintness`.
+fn write_inputs(folder: &Path, size: (usize, usize), shift: usize, faintness: u8) {
+    let (width, height) = size;
     for (name, shift) in [("left.ppm", 0), ("right.ppm", shift)] {
         let mut ppm = format!("P6\n{width} {height}\n255\n").into_bytes();
-        for y in 0..height {
-            let pixels = texture_row(y, shift).zip(texture_row(y + 900, shift)).take(width);
-            ppm.extend(pixels.flat_map(|(red, green)| [red, green, 90]));
-        }
+        ppm.extend(repeat_texture(size, shift, |v| [v / faintness, 255 - v / faintness, 90]));
         fs::write(folder.join(name), ppm).unwrap();
     }
     fs::create_dir_all(folder.join("masks")).unwrap();
-    let mask = (0..height).flat_map(|y| texture_row(y, 0).take(width).map(|v| v > 150)).collect();
-    cv_io::write_png(folder.join("masks/left.png"), Mask::from_vec(width, height, mask).unwrap().view()).unwrap();
+    let (columns, rows) = TEXTURE_SIZE;
+    let mask = Mask::from_fn(width, height, |x, y| [TEXTURE[y % rows * columns + x % columns] > 150]);
+    cv_io::write_png(folder.join("masks/left.png"), mask.view()).unwrap();
 }
 
 const RIG: &str = "schema: cv-rig/1\nunit: m\n\
@@ -104,7 +116,7 @@ fn was_stopped(Output { status, stdout, stderr }: Output, took: Duration, what: 
 fn a_stopped_command_leaves_all_files_unchanged() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    write_inputs(folder, (2400, 1800), 30);
+    write_inputs(folder, (2400, 1800), 30, 1);
     fs::write(folder.join("rig.yaml"), RIG).unwrap();
     for name in ["d.pfm", "c.png", "m.txt", "model.json"] {
         fs::write(folder.join(name), "old").unwrap();
@@ -141,8 +153,9 @@ fn names(folder: &Path) -> Vec<String> {
 fn an_output_in_progress_is_removed() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    // Large enough that writing takes longer than the program waits for a job to stop by itself.
-    write_inputs(folder, (4800, 3600), 30);
+    // Large enough that writing takes longer than the program waits for a job to stop by itself, and too faint for features, whose
+    // detection comes before.
+    write_inputs(folder, (4800, 3600), 30, 64);
     let sizes = [("2400", "4800"), ("1800", "3600"), ("1199.5", "2399.5"), ("899.5", "1799.5")];
     let rig = sizes.iter().fold(RIG.to_owned(), |rig, (from, to)| rig.replace(from, to));
     fs::write(folder.join("rig.yaml"), rig).unwrap();
@@ -178,7 +191,7 @@ fn an_output_in_progress_is_removed() {
 fn completed_frames_are_kept() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    write_inputs(folder, (640, 480), 20);
+    write_inputs(folder, (640, 480), 20, 1);
     for side in ["left", "right"] {
         fs::create_dir(folder.join(side)).unwrap();
         for i in 0..200 {
@@ -219,7 +232,7 @@ fn the_demo_stops_within_a_job() {
 fn a_command_that_waits_for_input_stops() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
-    write_inputs(folder, (64, 48), 3);
+    write_inputs(folder, (64, 48), 3, 1);
     fs::write(folder.join("left_mask.png"), "mask").unwrap();
     let made = Command::new("mkfifo").arg(folder.join("pipe.png")).arg(folder.join("pipe_mask.png")).status().unwrap();
     assert!(made.success());
