@@ -55,7 +55,7 @@ fn repeat_texture((width, height): (usize, usize), shift: usize, color: impl Fn(
     values
 }
 
-/// Two images of a textured wall, shifted by `shift` pixels, and a mask. The contrast is divided by `faintness`.
+/// Two images of a textured wall, shifted by `shift` pixels. The contrast is divided by `faintness`.
 fn write_inputs(folder: &Path, size: (usize, usize), shift: usize, faintness: u8) {
     let (width, height) = size;
     for (name, shift) in [("left.ppm", 0), ("right.ppm", shift)] {
@@ -63,9 +63,12 @@ fn write_inputs(folder: &Path, size: (usize, usize), shift: usize, faintness: u8
         ppm.extend(repeat_texture(size, shift, |v| [v / faintness, 255 - v / faintness, 90]));
         fs::write(folder.join(name), ppm).unwrap();
     }
-    fs::create_dir_all(folder.join("masks")).unwrap();
-    let (columns, rows) = TEXTURE_SIZE;
-    let mask = Mask::from_fn(width, height, |x, y| [TEXTURE[y % rows * columns + x % columns] > 150]);
+}
+
+/// A mask of the brighter pixels of the left image.
+fn write_mask(folder: &Path, (width, height): (usize, usize)) {
+    fs::create_dir(folder.join("masks")).unwrap();
+    let mask = Mask::from_fn(width, height, |x, y| [TEXTURE[y * TEXTURE_SIZE.0 + x] > 150]);
     cv_io::write_png(folder.join("masks/left.png"), mask.view()).unwrap();
 }
 
@@ -117,6 +120,7 @@ fn a_stopped_command_leaves_all_files_unchanged() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     write_inputs(folder, (2400, 1800), 30, 1);
+    write_mask(folder, (2400, 1800));
     fs::write(folder.join("rig.yaml"), RIG).unwrap();
     for name in ["d.pfm", "c.png", "m.txt", "model.json"] {
         fs::write(folder.join(name), "old").unwrap();
@@ -233,6 +237,7 @@ fn a_command_that_waits_for_input_stops() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     write_inputs(folder, (64, 48), 3, 1);
+    write_mask(folder, (64, 48));
     fs::write(folder.join("left_mask.png"), "mask").unwrap();
     let made = Command::new("mkfifo").arg(folder.join("pipe.png")).arg(folder.join("pipe_mask.png")).status().unwrap();
     assert!(made.success());
