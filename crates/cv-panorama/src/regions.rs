@@ -17,6 +17,11 @@ pub(crate) struct Region {
 }
 
 impl Region {
+    /// Returns a region of all pixels of a rectangle.
+    pub(crate) fn whole(bounds: Bounds) -> Self {
+        Self { bounds, step: 1, spans: Vec::new() }
+    }
+
     /// Returns the columns of a canvas row of the bounds that are sampled.
     pub(crate) fn span(&self, y: usize) -> Range<usize> {
         self.spans.get(y / self.step).cloned().unwrap_or(self.bounds.left..self.bounds.right)

@@ -18,7 +18,7 @@ use crate::blend::NO_PHOTO;
 use crate::compensation::Compensation;
 use crate::masks::{Filled, PhotoMask, PlacedMasks};
 use crate::photometric::Gains;
-use crate::regions::regions;
+use crate::regions::{Region, regions};
 use crate::render::{CompositingOptions, Drawing, PREVIEW_PIXELS, Panorama, RenderError, check, draw};
 use crate::seams::{self, Seams};
 use crate::surface::{
@@ -71,10 +71,10 @@ pub struct StreamedFrame {
 pub struct Layer<T = u8> {
     /// Index of the photograph.
     pub photo: usize,
-    /// Its part of the panorama: the bounding box of its mask with the margin of blending.
+    /// Its part of the panorama: the bounding box of the whole photograph.
     pub bounds: Bounds,
-    /// Red, green, blue, and the mask: white on the side of the seams where this photograph is taken. Outside the mask are the colors of the photograph as far
-    /// as blending needs them, beyond its border and that margin those of the nearest pixel.
+    /// Red, green, blue, and the mask: white on the side of the seams where this photograph is taken. Outside the mask are the other colors of the photograph,
+    /// black beyond its border.
     pub pixels: Image<T, 4>,
 }
 
@@ -278,7 +278,8 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
         adaptation: adaptation.as_ref(),
         masks: &placed,
     };
-    let warped = warped(photos, &drawing, &gains, &scratch, progress)?;
+    let mut warped = WarpedStore::new(&scratch);
+    each_warped(photos, &drawing, &gains, progress, |_, photo| Ok(warped.push(photo.as_ref())?))?;
     clock.lap("warp");
     let mut labels = LabelRows::new(canvas.0);
     {
@@ -309,7 +310,7 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     let shown = shown.unwrap_or(Bounds { left: 0, top: 0, right: canvas.0, bottom: canvas.1 });
     output.begin(&frame((shown.width(), shown.height()), alignment))?;
     if output.wants_layers() {
-        layers(&warped, &labels, shown, &photo_of, output, progress)?;
+        layers(photos, &drawing, &gains, (&labels, shown), output, progress)?;
     }
     let tiling = Tiling::within::<T>(budget.work, options.blend, levels, canvas.0);
     let strips = blend::Strips { photos: &warped, labels: &labels, typical_side, levels, mode: options.blend, tiling };
@@ -335,41 +336,37 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     Ok(panorama)
 }
 
-/// Hands on the layers of the part `shown` of the canvas.
+/// Hands on the layers of the part `shown` of the canvas. Warps the photographs again: for the panorama each is warped only around its label.
 fn layers<T: PhotoSample>(
-    photos: &WarpedStore<'_, T>,
-    labels: &LabelRows,
-    shown: Bounds,
-    photo_of: &[usize],
+    photos: &dyn PhotoSource<T>,
+    drawing: &Drawing<'_>,
+    gains: &Gains,
+    (labels, shown): (&LabelRows, Bounds),
     output: &mut dyn RowSink<T>,
     progress: &dyn Progress,
 ) -> Result<(), RenderError> {
-    let stage = Stage::new(progress, "blend", photo_of.len())?;
-    for (label, bounds) in photos.bounds().into_iter().enumerate() {
-        stage.add(1)?;
-        let Some(bounds) = bounds.and_then(|bounds| bounds.intersection(&shown)) else { continue };
-        let Some(mut photo) = photos.crop(label, bounds)? else { continue };
+    let placements = &drawing.layout.placements;
+    let visible = placements.iter().map(|placement| placement.bounds.intersection(&shown));
+    let regions: Vec<Option<Region>> = visible.map(|bounds| bounds.map(Region::whole)).collect();
+    each_warped(photos, &Drawing { regions: &regions, ..*drawing }, gains, progress, |k, photo| {
+        let Some(WarpedPhoto { bounds, mut pixels }) = photo else { return Ok(()) };
         let mut row = vec![NO_PHOTO; bounds.width()];
-        let mut is_used = false;
         for y in 0..bounds.height() {
             labels.read_row(bounds.top + y, bounds.left, &mut row);
-            for (pixel, name) in photo.pixels.row_mut(y).as_chunks_mut::<4>().0.iter_mut().zip(&row) {
-                let is_own = usize::from(*name) == label;
-                pixel[3] = if is_own { T::WHITE } else { T::default() };
-                is_used |= is_own;
+            for (pixel, label) in pixels.row_mut(y).as_chunks_mut::<4>().0.iter_mut().zip(&row) {
+                let is_covered = pixel[3] != T::default();
+                *pixel = if is_covered { *pixel } else { [T::default(); 4] };
+                pixel[3] = if usize::from(*label) == k { T::WHITE } else { T::default() };
             }
         }
-        if is_used {
-            let bounds = Bounds {
-                left: bounds.left - shown.left,
-                top: bounds.top - shown.top,
-                right: bounds.right - shown.left,
-                bottom: bounds.bottom - shown.top,
-            };
-            output.layer(Layer { photo: photo_of[label], bounds, pixels: photo.pixels })?;
-        }
-    }
-    Ok(())
+        let bounds = Bounds {
+            left: bounds.left - shown.left,
+            top: bounds.top - shown.top,
+            right: bounds.right - shown.left,
+            bottom: bounds.bottom - shown.top,
+        };
+        Ok(output.layer(Layer { photo: placements[k].photo, bounds, pixels })?)
+    })
 }
 
 fn frame(size: (usize, usize), alignment: &Alignment) -> StreamedFrame {
@@ -453,18 +450,17 @@ fn loaded<T: PhotoSample>(
     Ok(all)
 }
 
-/// Warps every placement to its region of the canvas, and writes it to the scratch file. The next photograph is loaded meanwhile.
-fn warped<'s, T: PhotoSample>(
+/// Warps every placement to its region of the canvas and hands it on, `None` without a region. The next photograph is loaded meanwhile.
+fn each_warped<T: PhotoSample>(
     photos: &dyn PhotoSource<T>,
     drawing: &Drawing<'_>,
     gains: &Gains,
-    scratch: &'s Scratch,
     progress: &dyn Progress,
-) -> Result<WarpedStore<'s, T>, RenderError> {
+    mut hand_on: impl FnMut(usize, Option<WarpedPhoto<T>>) -> Result<(), RenderError>,
+) -> Result<(), RenderError> {
     let placements = &drawing.layout.placements;
     let stage = Stage::new(progress, "warp", placements.len())?;
     let tone = gains.adapted_tone(drawing.adaptation, T::PARTS);
-    let mut store = WarpedStore::new(scratch);
     let load = |k: usize| -> Result<Option<Cow<'_, Image<T, 3>>>, StreamError> {
         let needed = placements.get(k).filter(|_| drawing.regions[k].is_some());
         needed.map(|p| load(photos, p.photo)).transpose()
@@ -476,11 +472,11 @@ fn warped<'s, T: PhotoSample>(
             Ok(Some(drawing.warped_one(photo.view(), k, region, gains, &tone, &stage)?))
         };
         let (piece, next) = rayon::join(draw, || load(k + 1));
-        store.push(piece?.as_ref())?;
+        hand_on(k, piece?)?;
         current = next?;
         stage.add(1)?;
     }
-    Ok(store)
+    Ok(())
 }
 
 #[cfg(test)]

@@ -254,3 +254,24 @@ fn layers_put_together_by_their_masks_are_the_panorama_without_blending() {
         assert!(labels == rows.labels && colors == rows.colors, "{crop}");
     }
 }
+
+#[test]
+fn a_layer_has_the_colors_of_the_whole_photograph() {
+    let options = CompositingOptions { resolution: 2.0, elastic: false, ..CompositingOptions::default() };
+    let limit = MemoryLimit { bytes: 1 << 40, scratch: scratch() };
+    let mut rows = Collected { layers: Some(Vec::new()), ..Collected::failing_at(usize::MAX) };
+    let made = render_streamed(&photos(), &alignment(), &options, limit, &mut rows, &cv_core::Silent).unwrap();
+    let layers = rows.layers.unwrap();
+    assert_eq!(layers.iter().map(|layer| layer.photo).collect::<Vec<_>>(), [0, 1, 2, 3, 4]);
+    let pixels = (0..rows.size.1).flat_map(|y| (0..rows.size.0).map(move |x| (x, y)));
+    for ((x, y), layer) in pixels.flat_map(|pixel| layers.iter().map(move |layer| (pixel, layer))) {
+        let b = layer.bounds;
+        let shows = b.contains(x, y) && layer.pixels.at(x - b.left, y - b.top)[..3] != [0; 3];
+        let source =
+            |dx: f64, dy: f64| made.map.source(layer.photo, cv_core::Point2::new(x as f64 + dx, y as f64 + dy));
+        // The scene is black nowhere. Half a pixel of the photograph beyond the centers of its outer pixels is covered, too: about one of the panorama.
+        let is_inside = source(0.0, 0.0).is_some();
+        let is_near = || [-2.0, 0.0, 2.0].iter().any(|dy| [-2.0, 0.0, 2.0].iter().any(|dx| source(*dx, *dy).is_some()));
+        assert!(if is_inside { shows } else { !shows || is_near() }, "{x} {y} of {}", layer.photo);
+    }
+}
