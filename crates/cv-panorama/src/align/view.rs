@@ -44,7 +44,7 @@ impl View {
         Self { camera: self.camera.scaled(factor), from_world: self.from_world }
     }
 
-    /// Samples the image border in order, `per_side` points per side.
+    /// Samples the border of the image in order, `per_side` points per side; where the lens model does not reach it, that of the model's range.
     pub(crate) fn border(&self, per_side: usize) -> Vec<Point2<f64>> {
         let (w, h) = (self.camera.width as f64 - 1.0, self.camera.height as f64 - 1.0);
         let n = per_side.max(1);
@@ -54,7 +54,25 @@ impl View {
                 let (a, b) = (corners[side], corners[(side + 1) % 4]);
                 (0..n).map(move |i| a + (b - a) * (i as f64 / n as f64))
             })
+            .map(|pixel| self.in_range(pixel))
             .collect()
+    }
+
+    /// Returns the pixel itself if it has a ray, and otherwise the farthest one towards the principal point that has.
+    fn in_range(&self, pixel: Point2<f64>) -> Point2<f64> {
+        let has_ray = |p: &Point2<f64>| self.camera.normalize(*p).iter().all(|v| v.is_finite());
+        let center = Point2::new(self.camera.cx, self.camera.cy);
+        if has_ray(&pixel) {
+            return pixel;
+        }
+        let at = |part: f64| center + (pixel - center) * part;
+        let (mut inside, mut beyond) = (0.0, 1.0);
+        // To a millionth of the distance.
+        for _ in 0..20 {
+            let middle = 0.5 * (inside + beyond);
+            *(if has_ray(&at(middle)) { &mut inside } else { &mut beyond }) = middle;
+        }
+        at(inside)
     }
 }
 
@@ -86,6 +104,21 @@ mod tests {
         assert!(view.contains(camera.denormalize(Point2::new(2.13, 0.0))));
         assert_eq!(view.project(&Vector3::new(2.13, 0.0, 1.0)), None);
         assert!(view.project(&Vector3::new(1.28, 0.0, 1.0)).is_some_and(|p| !view.contains(p)));
+    }
+
+    #[test]
+    fn the_border_is_that_of_the_range_of_the_lens_where_it_ends_before_the_image() {
+        let camera = Camera { distortion: Distortion::simple_radial(-0.3), ..Camera::from_focal(640, 480, 400.0) };
+        let view = View { camera, from_world: Matrix3::identity() };
+        // The distorted radius r (1 − 0.3 r²) increases up to r = √(1 / 0.9) = 1.054, where it is 2/3 of that: 281 of 320 pixels.
+        let limit = 400.0 * 2.0 / 3.0 * (1.0_f64 / 0.9).sqrt();
+        let pinhole = View { camera: Camera { distortion: Distortion::NONE, ..camera }, ..view };
+        for (reached, full) in view.border(9).into_iter().zip(pinhole.border(9)) {
+            let center = Point2::new(319.5, 239.5);
+            let (distance, to_border) = ((reached - center).norm(), (full - center).norm());
+            assert!((distance - to_border.min(limit)).abs() < 0.5, "{reached}");
+            assert!(view.ray(reached).is_some());
+        }
     }
 
     #[test]

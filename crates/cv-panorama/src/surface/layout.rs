@@ -482,6 +482,21 @@ mod tests {
     }
 
     #[test]
+    fn a_lens_model_that_ends_inside_the_photographs_limits_their_extent() {
+        let mut set = alignment(&[(0.0, 0.0), (0.4, 0.05)]);
+        for view in set.views.iter_mut().flatten() {
+            view.camera.distortion = cv_core::Distortion::simple_radial(-0.6);
+        }
+        for projection in Projection::NAMES.iter().map(|(_, p)| *p) {
+            let l = layout(&set, projection, &Framing::default(), 1.0, MANY).unwrap();
+            // r (1 − 0.6 r²) increases up to r = √(1 / 1.8), an angle of 36.7°; vertically the photographs end before.
+            let most = 500.0 * (2.0 * (1.0_f64 / 1.8).sqrt().atan() + 0.4);
+            assert!(l.width as f64 > 0.95 * most && (l.width as f64) < 1.4 * most, "{projection:?} {}", l.width);
+            assert!(l.height > 400 && l.height < 1000, "{projection:?} {}", l.height);
+        }
+    }
+
+    #[test]
     fn a_full_circle_is_one_period_wide_and_photographs_over_the_cut_are_drawn_twice() {
         let turns: Vec<_> = (0..10).map(|k| (f64::from(k) * TAU / 10.0, 0.0)).collect();
         let l = layout(&alignment(&turns), Projection::Auto, &Framing::default(), 1.0, MANY).unwrap();
