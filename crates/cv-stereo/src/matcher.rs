@@ -193,6 +193,7 @@ impl StereoMatcher {
         clock.lap("coarse");
         self.describe_pixels();
         clock.lap("bits");
+        progress.report("bits", 1, 1)?;
         self.set_priors(coarse, map, (width, height));
         clock.lap("coarse");
         self.aggregate(width, height, progress)?;
