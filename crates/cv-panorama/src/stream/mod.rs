@@ -74,7 +74,7 @@ pub struct Layer<T = u8> {
     /// Its part of the panorama: the bounding box of the whole photograph.
     pub bounds: Bounds,
     /// Red, green, blue, and the mask: white on the side of the seams where this photograph is taken. Outside the mask are the other colors of the photograph,
-    /// black beyond its border.
+    /// black beyond its border and where the photographs' masks exclude it.
     pub pixels: Image<T, 4>,
 }
 
@@ -91,7 +91,7 @@ pub trait RowSink<T>: Send {
         false
     }
 
-    /// Receives a photograph as it is composited, before the rows and in no particular order; twice one that lies at both ends of a full circle.
+    /// Receives a photograph before the rows, also one of which no pixel is taken; twice one that lies at both ends of a full circle.
     ///
     /// # Errors
     /// [`NotWritten`] ends the work.
@@ -183,7 +183,7 @@ impl From<NotWritten> for RenderError {
 /// Composites a panorama within a limit of memory, and hands it on in rows.
 ///
 /// As [`render`](crate::render), to the same pixels; `image`, `mask` and `labels` of the result are empty. Reports as the stages "elastic", "preview", "exposure", "seams",
-/// "warp", "seams" again, and "blend", which includes the writing of rows.
+/// "warp", "seams" again, and "blend", which includes layers and the writing of rows.
 ///
 /// # Errors
 /// [`RenderError`]; [`StreamError::Memory`] and [`StreamError::Whole`] before photographs are loaded.
@@ -279,7 +279,10 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
         masks: &placed,
     };
     let mut warped = WarpedStore::new(&scratch);
-    each_warped(photos, &drawing, &gains, progress, |_, photo| Ok(warped.push(photo.as_ref())?))?;
+    {
+        let stage = Stage::new(progress, "warp", layout.placements.len())?;
+        each_warped(photos, &drawing, &gains, &stage, |_, photo| Ok(warped.push(photo.as_ref())?))?;
+    }
     clock.lap("warp");
     let mut labels = LabelRows::new(canvas.0);
     {
@@ -348,24 +351,20 @@ fn layers<T: PhotoSample>(
     let placements = &drawing.layout.placements;
     let visible = placements.iter().map(|placement| placement.bounds.intersection(&shown));
     let regions: Vec<Option<Region>> = visible.map(|bounds| bounds.map(Region::whole)).collect();
-    each_warped(photos, &Drawing { regions: &regions, ..*drawing }, gains, progress, |k, photo| {
+    let stage = Stage::new(progress, "blend", placements.len())?;
+    each_warped(photos, &Drawing { regions: &regions, ..*drawing }, gains, &stage, |k, photo| {
         let Some(WarpedPhoto { bounds, mut pixels }) = photo else { return Ok(()) };
         let mut row = vec![NO_PHOTO; bounds.width()];
         for y in 0..bounds.height() {
             labels.read_row(bounds.top + y, bounds.left, &mut row);
             for (pixel, label) in pixels.row_mut(y).as_chunks_mut::<4>().0.iter_mut().zip(&row) {
-                let is_covered = pixel[3] != T::default();
-                *pixel = if is_covered { *pixel } else { [T::default(); 4] };
+                if pixel[3] == T::default() {
+                    *pixel = [T::default(); 4];
+                }
                 pixel[3] = if usize::from(*label) == k { T::WHITE } else { T::default() };
             }
         }
-        let bounds = Bounds {
-            left: bounds.left - shown.left,
-            top: bounds.top - shown.top,
-            right: bounds.right - shown.left,
-            bottom: bounds.bottom - shown.top,
-        };
-        Ok(output.layer(Layer { photo: placements[k].photo, bounds, pixels })?)
+        Ok(output.layer(Layer { photo: placements[k].photo, bounds: bounds.relative_to(&shown), pixels })?)
     })
 }
 
@@ -455,11 +454,10 @@ fn each_warped<T: PhotoSample>(
     photos: &dyn PhotoSource<T>,
     drawing: &Drawing<'_>,
     gains: &Gains,
-    progress: &dyn Progress,
+    stage: &Stage<'_>,
     mut hand_on: impl FnMut(usize, Option<WarpedPhoto<T>>) -> Result<(), RenderError>,
 ) -> Result<(), RenderError> {
     let placements = &drawing.layout.placements;
-    let stage = Stage::new(progress, "warp", placements.len())?;
     let tone = gains.adapted_tone(drawing.adaptation, T::PARTS);
     let load = |k: usize| -> Result<Option<Cow<'_, Image<T, 3>>>, StreamError> {
         let needed = placements.get(k).filter(|_| drawing.regions[k].is_some());
@@ -469,7 +467,7 @@ fn each_warped<T: PhotoSample>(
     for k in 0..placements.len() {
         let draw = || -> Result<Option<WarpedPhoto<T>>, RenderError> {
             let (Some(photo), Some(region)) = (&current, &drawing.regions[k]) else { return Ok(None) };
-            Ok(Some(drawing.warped_one(photo.view(), k, region, gains, &tone, &stage)?))
+            Ok(Some(drawing.warped_one(photo.view(), k, region, gains, &tone, stage)?))
         };
         let (piece, next) = rayon::join(draw, || load(k + 1));
         hand_on(k, piece?)?;

@@ -136,13 +136,7 @@ impl<'a, T: Internals> WarpedStore<'a, T> {
         let at = at + ((part.top - bounds.top) * stride + (part.left - bounds.left) * pixel) as u64;
         let mut pixels = Image::<T, 4>::new(part.width(), part.height(), [T::default(); 4]);
         T::fill_from_bytes(pixels.as_mut_slice(), |bytes| self.scratch.read_rows(at, stride, row, bytes))?;
-        let bounds = Bounds {
-            left: part.left - window.left,
-            top: part.top - window.top,
-            right: part.right - window.left,
-            bottom: part.bottom - window.top,
-        };
-        Ok(Some(WarpedPhoto { bounds, pixels }))
+        Ok(Some(WarpedPhoto { bounds: part.relative_to(&window), pixels }))
     }
 
     /// Reads the parts of all photographs inside `window`, as [`Self::crop`].

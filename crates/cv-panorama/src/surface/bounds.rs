@@ -47,6 +47,16 @@ impl Bounds {
         (b.left < b.right && b.top < b.bottom).then_some(b)
     }
 
+    /// Returns the rectangle in the coordinates of one that contains it.
+    pub(crate) fn relative_to(&self, outer: &Self) -> Self {
+        Self {
+            left: self.left - outer.left,
+            top: self.top - outer.top,
+            right: self.right - outer.left,
+            bottom: self.bottom - outer.top,
+        }
+    }
+
     /// Grows the rectangle by `by` pixels on all sides, clipped to a canvas.
     pub(crate) fn grown(&self, by: usize, width: usize, height: usize) -> Self {
         Self {
@@ -81,6 +91,8 @@ mod tests {
         assert!(b.contains(5, 8) && !b.contains(20, 8) && !b.contains(5, 9));
         let other = Bounds { left: 18, top: 0, right: 40, bottom: 3 };
         assert_eq!(b.intersection(&other), Some(Bounds { left: 18, top: 2, right: 20, bottom: 3 }));
+        let inner = Bounds { left: 6, top: 4, right: 8, bottom: 9 };
+        assert_eq!(inner.relative_to(&b), Bounds { left: 1, top: 2, right: 3, bottom: 7 });
         assert_eq!(b.intersection(&Bounds { left: 20, ..other }), None);
         assert_eq!(b.grown(3, 22, 100), Bounds { left: 2, top: 0, right: 22, bottom: 12 });
     }
