@@ -6,7 +6,7 @@ use cv_core::{Cancelled, GrayF32, Stage, luma_f32};
 use cv_parallel::prelude::*;
 
 /// Patch radius in preview pixels.
-const PATCH_RADIUS: usize = 4;
+pub(super) const PATCH_RADIUS: usize = 4;
 /// Grid spacing of the patches in preview pixels.
 const SPACING: usize = 3;
 /// Minimum root mean square contrast of a patch, in gray levels: low-texture patches are skipped.
@@ -57,7 +57,7 @@ impl Misalignments {
 }
 
 /// Converts a piece to luma; NaN where the photograph does not cover the pixel.
-fn luma(piece: &Piece) -> GrayF32 {
+pub(super) fn luma(piece: &Piece) -> GrayF32 {
     let (w, h) = piece.warped.pixels.size();
     GrayF32::from_fn(w, h, |x, y| {
         let [r, g, b, a] = piece.warped.pixels.at(x, y).map(f32::from);
@@ -112,7 +112,7 @@ fn extend_to_borders(pixels: &mut [f32], columns: usize) {
 fn displacement(first: &GrayF32, p: (isize, isize), second: &GrayF32, q: (isize, isize)) -> f32 {
     const SIDE: usize = 2 * PATCH_RADIUS + 1;
     let mut patch = [0.0_f32; SIDE * SIDE];
-    let (Some(ours), Some(theirs)) = (rows(first, p), rows(second, q)) else { return f32::NAN };
+    let (Some(ours), Some(theirs)) = (patch_rows(first, p), patch_rows(second, q)) else { return f32::NAN };
     if theirs.clone().flatten().any(|v| v.is_nan()) {
         return f32::NAN;
     }
@@ -123,7 +123,7 @@ fn displacement(first: &GrayF32, p: (isize, isize), second: &GrayF32, q: (isize,
     if template.energy().is_nan() {
         return f32::NAN;
     }
-    if template.energy() < (SIDE * SIDE) as f32 * MIN_CONTRAST * MIN_CONTRAST {
+    if !has_contrast(&template) {
         return 0.0;
     }
     if template.score(theirs) > 1.0 - CORRELATION_TOLERANCE {
@@ -151,8 +151,14 @@ fn displacement(first: &GrayF32, p: (isize, isize), second: &GrayF32, q: (isize,
     (0..scores.len()).filter(|&i| scores[i] >= best - CORRELATION_TOLERANCE).map(distance).fold(f32::INFINITY, f32::min)
 }
 
+/// Returns whether a patch has enough texture to be compared; false where it contains NaN.
+pub(super) fn has_contrast(patch: &Template) -> bool {
+    const PIXELS: usize = (2 * PATCH_RADIUS + 1) * (2 * PATCH_RADIUS + 1);
+    patch.energy() >= PIXELS as f32 * MIN_CONTRAST * MIN_CONTRAST
+}
+
 /// Returns the rows of the patch around a pixel; `None` where it is not complete.
-fn rows(image: &GrayF32, (x, y): (isize, isize)) -> Option<impl Iterator<Item = &[f32]> + Clone> {
+pub(super) fn patch_rows(image: &GrayF32, (x, y): (isize, isize)) -> Option<impl Iterator<Item = &[f32]> + Clone> {
     let h = PATCH_RADIUS as isize;
     let inside = x >= h && y >= h && x + h < image.width() as isize && y + h < image.height() as isize;
     inside.then(|| (y - h..=y + h).map(move |y| &image.row(y as usize)[(x - h) as usize..=(x + h) as usize]))

@@ -2,10 +2,11 @@
 //!
 //! A label per canvas pixel selects the photograph. The smoothness term between neighbors `p` and `q` with labels `a` and `b` is the difference of the two
 //! photographs at both pixels, in color and gradient, so that seams avoid moving objects and misalignments. The energy is minimized by alpha expansion: on a
-//! preview first, then in full resolution in a band around the seams.
+//! preview first, then in full resolution in a band around the seams. Between the two, the breaks of objects that a seam must cut are measured.
 
 mod alpha_expansion;
 mod border;
+mod breaks;
 mod contradiction;
 mod cost;
 mod misalignment;
@@ -13,6 +14,7 @@ mod transient;
 mod upsample;
 mod windows;
 
+pub(crate) use breaks::find as find_breaks;
 pub(crate) use upsample::{upsample, upsample_rows};
 pub(crate) use windows::{refine_in_windows, window_memory};
 

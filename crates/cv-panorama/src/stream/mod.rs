@@ -19,7 +19,7 @@ use crate::compensation::Compensation;
 use crate::masks::{Filled, PhotoMask, PlacedMasks};
 use crate::photometric::Gains;
 use crate::regions::{Region, regions};
-use crate::render::{CompositingOptions, Drawing, PREVIEW_PIXELS, Panorama, RenderError, check, draw};
+use crate::render::{CompositingOptions, Drawing, PREVIEW_PIXELS, Panorama, RenderError, check, closed_breaks, draw};
 use crate::seams::{self, Seams};
 use crate::surface::{
     Bounds, Layout, PhotoMap, Preview, PreviewScale, ROUND_UNITS, WarpedPhoto, displacements_with, downsample_box,
@@ -265,6 +265,8 @@ pub(crate) fn draw_streamed<T: PhotoSample>(
     clock.lap("exposure");
     let coarse =
         seams::on_preview(&preview, &photo_of, options.seams, options.radiance, options.removes_transients, progress)?;
+    let fields = closed_breaks(&preview, &coarse, &layout, &fields, options, progress)?.unwrap_or(fields);
+    let placed = PlacedMasks::new(&masks, &layout, &fields);
     let step = preview.step;
     let regions = regions(&coarse, &preview, &layout, levels);
     drop(preview);

@@ -1,5 +1,6 @@
 //! Normalized cross-correlation of a small square patch over a search window.
 
+use cv_core::Vector2;
 use fearless_simd::{Level, dispatch, f32x16, prelude::*};
 
 /// Search radius, in pixels of the patch: the largest whose displacements along a row fit in two vectors of AVX2.
@@ -106,6 +107,37 @@ impl Template {
         let count = self.centered.len() as f32;
         product / (self.energy * (squares - sum * sum / count).max(count / 12.0)).sqrt()
     }
+}
+
+/// Correlations within this of the maximum make it ambiguous.
+pub(super) const AMBIGUITY: f32 = 0.05;
+
+/// Returns the displacement of the maximum of the correlations at all displacements of a square (row-major, `side` odd) from its middle, with parabolic sub-pixel interpolation; `None` below
+/// `min_correlation`, on the border of the square, and for an ambiguous maximum.
+pub(crate) fn score_maximum(scores: &[f32], side: usize, min_correlation: f32) -> Option<Vector2<f64>> {
+    let (best, &score) = scores.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
+    let (y, x) = (best / side, best % side);
+    if score < min_correlation || x == 0 || y == 0 || x == side - 1 || y == side - 1 {
+        return None;
+    }
+    // Repeated structure: a second maximum that is nearly as high.
+    let is_ambiguous = scores.iter().enumerate().any(|(i, s)| {
+        let far = (i / side).abs_diff(y).max((i % side).abs_diff(x)) > 2;
+        far && *s > score - AMBIGUITY
+    });
+    if is_ambiguous {
+        return None;
+    }
+    let fx = parabola_peak(scores[best - 1], score, scores[best + 1]);
+    let fy = parabola_peak(scores[best - side], score, scores[best + side]);
+    let middle = (side / 2) as f64;
+    Some(Vector2::new(x as f64 + fx - middle, y as f64 + fy - middle))
+}
+
+/// Returns the offset of the maximum of the parabola through three neighboring scores from the middle one.
+pub(crate) fn parabola_peak(a: f32, b: f32, c: f32) -> f64 {
+    let curvature = a - 2.0 * b + c;
+    if curvature < 0.0 { f64::from(0.5 * (a - c) / curvature).clamp(-0.5, 0.5) } else { 0.0 }
 }
 
 #[cfg(test)]

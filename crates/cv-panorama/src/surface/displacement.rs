@@ -54,6 +54,22 @@ impl DisplacementField {
         self.around(p).iter().map(|&(i, w)| self.displacement[i] * w).sum()
     }
 
+    /// Returns the canvas position of vertex `i`.
+    fn vertex(&self, i: usize) -> Point2<f64> {
+        let (x, y) = (i % self.columns, i / self.columns);
+        Point2::new(self.left + x as f64 * self.spacing, self.top + y as f64 * self.spacing)
+    }
+
+    /// Returns the field, on the same grid, that displaces by `before` first and then by this one.
+    pub(super) fn after(mut self, before: Option<&Self>) -> Self {
+        let Some(before) = before else { return self };
+        for i in 0..self.displacement.len() {
+            let between = self.vertex(i) - self.displacement[i];
+            self.displacement[i] += before.at(between);
+        }
+        self
+    }
+
     /// Returns the field for a canvas and a photograph scaled by these factors.
     pub(crate) fn scaled(&self, canvas: f64, photo: f64) -> Self {
         let place = |v: f64| Scaling::coordinate(v, canvas);
@@ -106,16 +122,13 @@ impl DisplacementField {
 
     /// Recomputes `source_shift` from `displacement`.
     pub(super) fn update_source_shift(&mut self, placement: &Placement, surface: &Surface) {
-        for y in 0..self.rows {
-            for x in 0..self.columns {
-                let i = y * self.columns + x;
-                let p = Point2::new(self.left + x as f64 * self.spacing, self.top + y as f64 * self.spacing);
-                let project = |p: Point2<f64>| placement.view.project(&surface.inverse(p + placement.origin.coords));
-                self.source_shift[i] = match (project(p), project(p - self.displacement[i])) {
-                    (Some(a), Some(b)) => [(b.x - a.x) as f32, (b.y - a.y) as f32],
-                    _ => [0.0; 2],
-                };
-            }
+        for i in 0..self.displacement.len() {
+            let p = self.vertex(i);
+            let project = |p: Point2<f64>| placement.view.project(&surface.inverse(p + placement.origin.coords));
+            self.source_shift[i] = match (project(p), project(p - self.displacement[i])) {
+                (Some(a), Some(b)) => [(b.x - a.x) as f32, (b.y - a.y) as f32],
+                _ => [0.0; 2],
+            };
         }
     }
 }
@@ -212,6 +225,21 @@ mod tests {
             let there = Point2::new((x + 0.5) * factor - 0.5, (y + 0.5) * factor - 0.5);
             prop_assert!((field.scaled(factor, 1.0).at(there) - field.at(p) * factor).norm() < 1e-9);
         }
+    }
+
+    #[test]
+    fn one_field_after_another_displaces_by_both() {
+        let (first, mut second) = (affine(12.0), affine(7.0));
+        second.displacement.iter_mut().for_each(|d| *d *= -0.5);
+        let own = second.clone();
+        let both = second.after(Some(&first));
+        for i in 0..both.displacement.len() {
+            // What the second shows at the vertex, the first shows where that came from.
+            let between = own.vertex(i) - own.displacement[i];
+            let source = between - first.at(between);
+            assert!((own.vertex(i) - both.displacement[i] - source).norm() < 1e-9, "{i}");
+        }
+        assert_eq!(own.clone().after(None), own);
     }
 
     #[test]

@@ -2,30 +2,42 @@
 //! elastic warping).
 //!
 //! Each photograph on the canvas has a displacement field on a coarse grid. The energy has a data term (tie points coincide), a smoothness term and a
-//! damping term (zero displacement without data); it is minimized by iteratively reweighted least squares.
+//! damping term (zero displacement without data); it is minimized by iteratively reweighted least squares. After the seams are found, the breaks of objects at
+//! them are closed on a finer grid (see `seams::breaks`).
 
 use crate::align::Alignment;
 use crate::masks::{PhotoMask, is_removed, is_removed_near};
+use crate::surface::correlation::AMBIGUITY;
 use crate::surface::structure_tensor::StructureTensor;
-use crate::surface::{DisplacementField, Layout, PAD, Placement, SEARCH_RADIUS, SEARCH_SIDE, Surface, Template};
-use cv_core::{Cancelled, GrayU8, ImageView, Point2, Progress, Stage, Vector2};
+use crate::surface::{
+    DisplacementField, Layout, PAD, Placement, SEARCH_RADIUS, SEARCH_SIDE, Surface, Template, parabola_peak,
+    score_maximum,
+};
+use cv_core::{Cancelled, GrayU8, ImageView, Point2, Progress, Scaling, Stage, Vector2};
 use cv_imgproc::{SAMPLE_LANES, bilinear_lanes};
 use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch};
 use std::ops::Deref;
 
-/// A correspondence of two placements, in canvas pixels before displacement.
+/// A correspondence of two placements: the difference of their displacements at two canvas positions.
 #[derive(Clone, Copy)]
 struct TiePoint {
     p: usize,
     q: usize,
     a: Point2<f64>,
     b: Point2<f64>,
+    /// Displacement of `p` at `a` minus that of `q` at `b`.
+    difference: Vector2<f64>,
     /// Unit normal of the edge, where the position along it is unknown (aperture problem).
     normal: Option<Vector2<f64>>,
 }
 
 impl TiePoint {
+    /// A point of the scene that the placements show at these canvas positions before displacement.
+    fn point(p: usize, q: usize, a: Point2<f64>, b: Point2<f64>, normal: Option<Vector2<f64>>) -> Self {
+        Self { p, q, a, b, difference: b - a, normal }
+    }
+
     /// Returns the component of a displacement that the tie point measures.
     fn measured(normal: Option<Vector2<f64>>, v: Vector2<f64>) -> Vector2<f64> {
         normal.map_or(v, |n| n * n.dot(&v))
@@ -38,6 +50,8 @@ const CELLS: f64 = 24.0;
 const SMOOTHNESS: f64 = 0.15;
 /// Weight of the damping term: a displacement decays over √(SMOOTHNESS / DAMPING) = 5 cells, a fifth of a photograph.
 const DAMPING: f64 = 0.006;
+/// Scale of the robust loss in canvas pixels: feature positions have errors of up to a pixel, registered patches of a fraction.
+const LOSS_SCALE: f64 = 3.0;
 /// Weight of the continuity of a photograph across the border of a canvas that spans 360°, relative to a tie point: dominates the tie points of a cell.
 const CONTINUITY: f64 = 30.0;
 /// Rounds of iteratively reweighted least squares.
@@ -46,6 +60,10 @@ const ROUNDS: u32 = 5;
 const TOLERANCE: f64 = 1e-8;
 /// Tolerance in the rounds before, whose weights are of a wider loss.
 const ROUND_TOLERANCE: f64 = 1e-4;
+/// How much finer the grid is on which the breaks at seams are closed.
+const REFINEMENT: f64 = 2.0;
+/// Displacement in canvas pixels up to which a photograph counts as not displaced: invisible.
+const NO_DISPLACEMENT_PX: f64 = 0.05;
 /// Maximum displacement of a tie point relative to the side of a photograph; larger ones are outliers.
 const MAX_DISPLACEMENT_RATIO: f64 = 0.04;
 
@@ -87,11 +105,10 @@ where
     let side = layout.typical_side();
     let spacing = (side / CELLS).max(8.0);
     let mut fields: Vec<_> = layout.placements.iter().map(|p| DisplacementField::over(&p.bounds, spacing)).collect();
-    let mut ties = feature_ties(layout, alignment, MAX_DISPLACEMENT_RATIO * side, stage)?;
+    let mut ties = feature_ties(layout, alignment, max_displacement(layout), stage)?;
     ties.retain(|t| !is_removed(masks, layout, t.p, t.a) && !is_removed(masks, layout, t.q, t.b));
     let continuity = border_ties(layout, spacing);
-    // Feature positions have errors of up to a pixel, registered patches of a fraction.
-    solve(&mut fields, &ties, &continuity, 3.0, stage)?;
+    solve(&mut fields, &ties, &continuity, DAMPING, LOSS_SCALE, stage)?;
     stage.add(1)?;
     let mut sites = patch_sites(layout, spacing);
     sites.retain(|site| ![site.p, site.q].iter().any(|&k| is_removed_near(masks, layout, k, site.at, WINDOW_RADIUS)));
@@ -102,13 +119,58 @@ where
         ties.truncate(features);
         ties.extend(sites.iter().filter_map(|site| site.tie));
         stage.add(1)?;
-        solve(&mut fields, &ties, &continuity, 3.0, stage)?;
+        solve(&mut fields, &ties, &continuity, DAMPING, LOSS_SCALE, stage)?;
         stage.add(1)?;
     }
     for (field, placement) in fields.iter_mut().zip(&layout.placements) {
         field.update_source_shift(placement, &layout.surface);
     }
     Ok(fields.into_iter().map(Some).collect())
+}
+
+/// Returns the maximum displacement between two photographs, in canvas pixels.
+pub(crate) fn max_displacement(layout: &Layout) -> f64 {
+    MAX_DISPLACEMENT_RATIO * layout.typical_side()
+}
+
+/// A correspondence across a seam, in preview pixels: at `at`, the content of placement `q` is this far off that of `p`.
+pub(crate) struct SeamTie {
+    pub(crate) p: usize,
+    pub(crate) q: usize,
+    pub(crate) at: Point2<f64>,
+    pub(crate) displacement: Vector2<f64>,
+}
+
+/// Returns the displacement fields that also close the breaks of objects at the seams: nearer objects are displaced towards each other on both sides of a seam, which fades away from it. `step` is that of
+/// the preview.
+pub(crate) fn close_breaks(
+    fields: &[Option<DisplacementField>],
+    ties: &[SeamTie],
+    step: usize,
+    layout: &Layout,
+    stage: &Stage<'_>,
+) -> Result<Vec<Option<DisplacementField>>, Cancelled> {
+    // A finer grid: objects are narrower than the overlap.
+    let spacing = (layout.typical_side() / (CELLS * REFINEMENT)).max(4.0);
+    let mut closing: Vec<_> = layout.placements.iter().map(|p| DisplacementField::over(&p.bounds, spacing)).collect();
+    let scale = step as f64;
+    let tie = |tie: &SeamTie| {
+        let at = Scaling::uniform(scale).point(tie.at);
+        TiePoint { p: tie.p, q: tie.q, a: at, b: at, difference: tie.displacement * scale, normal: None }
+    };
+    let ties: Vec<TiePoint> = ties.iter().map(tie).collect();
+    // The same decay as that of the coarser grid.
+    let damping = DAMPING / (REFINEMENT * REFINEMENT);
+    solve(&mut closing, &ties, &border_ties(layout, spacing), damping, f64::INFINITY, stage)?;
+    let both = |((closing, before), placement): ((DisplacementField, &Option<DisplacementField>), &Placement)| {
+        if closing.displacement.iter().all(|d| d.amax() < NO_DISPLACEMENT_PX) {
+            return before.clone();
+        }
+        let mut field = closing.after(before.as_ref());
+        field.update_source_shift(placement, &layout.surface);
+        Some(field)
+    };
+    Ok(closing.into_iter().zip(fields).zip(&layout.placements).map(both).collect())
 }
 
 /// Maps a pixel of a photograph to the canvas, before displacement.
@@ -140,7 +202,7 @@ fn feature_ties(
                         continue;
                     };
                     if (a - b).norm() < max_displacement {
-                        ties.push(TiePoint { p, q, a, b, normal: None });
+                        ties.push(TiePoint::point(p, q, a, b, None));
                     }
                 }
             }
@@ -160,18 +222,20 @@ fn border_ties(layout: &Layout, spacing: f64) -> Vec<TiePoint> {
             for y in rows.step_by(spacing as usize) {
                 // The border is half a pixel left of the center of the first column.
                 let a = Point2::new(-0.5, y as f64);
-                ties.push(TiePoint { p, q, a, b: a + Vector2::new(period, 0.0), normal: None });
+                let b = a + Vector2::new(period, 0.0);
+                ties.push(TiePoint { p, q, a, b, difference: Vector2::zeros(), normal: None });
             }
         }
     }
     ties
 }
 
-/// Solves for the fields by iteratively reweighted least squares (Cauchy weights of `scale` pixels) and conjugate gradients; `continuity` are positions at which two fields are equal.
+/// Solves for the fields by iteratively reweighted least squares (Cauchy weights of `scale` pixels, infinite for least squares) and conjugate gradients; `continuity` are positions at which two fields are equal.
 fn solve(
     fields: &mut [DisplacementField],
     ties: &[TiePoint],
     continuity: &[TiePoint],
+    damping: f64,
     scale: f64,
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
@@ -189,8 +253,7 @@ fn solve(
         };
         std::array::from_fn(term)
     };
-    let mut terms: Vec<Term> = ties.iter().map(|t| (vertices(t), t.b - t.a, t.normal)).collect();
-    terms.extend(continuity.iter().map(|t| (vertices(t), Vector2::zeros(), None)));
+    let terms: Vec<Term> = ties.iter().chain(continuity).map(|t| (vertices(t), t.difference, t.normal)).collect();
     let mut edges = Vec::new();
     for (f, offset) in fields.iter().zip(&offsets) {
         for y in 0..f.rows {
@@ -207,9 +270,10 @@ fn solve(
     }
     let mut d: Vec<Vector2<f64>> = fields.iter().flat_map(|f| f.displacement.iter().copied()).collect();
     let left = |d: &[Vector2<f64>], t: &[(usize, f64); 8]| -> Vector2<f64> { t.iter().map(|&(i, w)| d[i] * w).sum() };
-    for round in 0..ROUNDS {
+    let rounds = if scale.is_finite() { ROUNDS } else { 1 };
+    for round in 0..rounds {
         // The scale shrinks from round to round (graduated non-convexity).
-        let scale = scale * f64::from(1 << (ROUNDS - 1 - round));
+        let scale = scale * f64::from(1 << (rounds - 1 - round));
         let weight = |(t, want, normal): &Term| {
             let residual = TiePoint::measured(*normal, left(&d, t) - want);
             1.0 / (1.0 + residual.norm_squared() / (scale * scale))
@@ -217,7 +281,7 @@ fn solve(
         let weights = terms[..ties.len()].iter().map(weight);
         let weights: Vec<f64> = weights.chain(continuity.iter().map(|_| CONTINUITY)).collect();
         let apply = |x: &[Vector2<f64>]| {
-            let mut out: Vec<Vector2<f64>> = x.iter().map(|v| v * DAMPING).collect();
+            let mut out: Vec<Vector2<f64>> = x.iter().map(|v| v * damping).collect();
             for &(i, j) in &edges {
                 let pull = (x[i] - x[j]) * SMOOTHNESS;
                 out[i] += pull;
@@ -232,7 +296,7 @@ fn solve(
             out
         };
         let mut right = vec![Vector2::zeros(); n];
-        let mut diagonal = vec![Vector2::repeat(DAMPING); n];
+        let mut diagonal = vec![Vector2::repeat(damping); n];
         for &(i, j) in &edges {
             diagonal[i] += Vector2::repeat(SMOOTHNESS);
             diagonal[j] += Vector2::repeat(SMOOTHNESS);
@@ -245,7 +309,7 @@ fn solve(
                 diagonal[i] += axes * (c * c * w);
             }
         }
-        let tolerance = if round + 1 < ROUNDS { ROUND_TOLERANCE } else { TOLERANCE };
+        let tolerance = if round + 1 < rounds { ROUND_TOLERANCE } else { TOLERANCE };
         conjugate_gradients(apply, &right, &diagonal, &mut d, tolerance, stage)?;
     }
     for (f, offset) in fields.iter_mut().zip(&offsets) {
@@ -409,7 +473,7 @@ fn register_overlap(
         site.is_low_texture = tensor.strengths[1] < MIN_CORNER_STRENGTH && !tensor.is_edge();
         let tie = |offset: Vector2<f64>, normal: Option<Vector2<f64>>| {
             let other = c + offset;
-            TiePoint { p, q, a: c - fields[p].at(c), b: other - fields[q].at(other), normal }
+            TiePoint::point(p, q, c - fields[p].at(c), other - fields[q].at(other), normal)
         };
         if tensor.strengths[1] >= MIN_CORNER_STRENGTH
             && let Some(second) = sample(1, right, wide, wide)
@@ -517,41 +581,17 @@ fn register_edge(first: &[f32], second: &[f32]) -> Option<f64> {
     if scores.iter().enumerate().any(|(i, s)| i.abs_diff(best) > 2 && *s > score - AMBIGUITY) {
         return None;
     }
-    Some(best as f64 + peak(scores[best - 1], score, scores[best + 1]) - SEARCH_RADIUS as f64)
-}
-
-/// Returns the offset of the maximum of the parabola through three neighboring scores from the middle one.
-fn peak(a: f32, b: f32, c: f32) -> f64 {
-    let curvature = a - 2.0 * b + c;
-    if curvature < 0.0 { f64::from(0.5 * (a - c) / curvature).clamp(-0.5, 0.5) } else { 0.0 }
+    Some(best as f64 + parabola_peak(scores[best - 1], score, scores[best + 1]) - SEARCH_RADIUS as f64)
 }
 
 /// Minimum correlation of registered patches.
 const MIN_CORRELATION: f32 = 0.85;
-/// Correlations within this of the maximum make it ambiguous.
-const AMBIGUITY: f32 = 0.05;
-
 /// Estimates the displacement of `first` in the larger window `second` by normalized cross-correlation with parabolic sub-pixel interpolation; `None` for a low
 /// or ambiguous maximum.
 fn register(first: &[f32], mut second: Vec<f32>) -> Option<Vector2<f64>> {
     second.resize(second.len() + PAD, 0.0);
     let scores = Template::new(2 * PATCH_RADIUS + 1, first).scores(&second);
-    let (best, &score) = scores.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1))?;
-    let (y, x) = (best / SEARCH_SIDE, best % SEARCH_SIDE);
-    if score < MIN_CORRELATION || x == 0 || y == 0 || x == SEARCH_SIDE - 1 || y == SEARCH_SIDE - 1 {
-        return None;
-    }
-    // Repeated structure: a second maximum that is nearly as high.
-    let is_ambiguous = scores.iter().enumerate().any(|(i, s)| {
-        let far = (i / SEARCH_SIDE).abs_diff(y).max((i % SEARCH_SIDE).abs_diff(x)) > 2;
-        far && *s > score - AMBIGUITY
-    });
-    if is_ambiguous {
-        return None;
-    }
-    let fx = peak(scores[best - 1], score, scores[best + 1]);
-    let fy = peak(scores[best - SEARCH_SIDE], score, scores[best + SEARCH_SIDE]);
-    Some(Vector2::new(x as f64 + fx - SEARCH_RADIUS as f64, y as f64 + fy - SEARCH_RADIUS as f64))
+    score_maximum(&scores, SEARCH_SIDE, MIN_CORRELATION)
 }
 
 #[cfg(test)]
@@ -638,6 +678,40 @@ mod tests {
         for field in fields.iter().flatten() {
             // The accuracy of patch registration with gray levels rounded to integers.
             assert!(field.displacement.iter().all(|d| d.norm() < 0.1), "{:?}", field.displacement);
+        }
+    }
+
+    #[test]
+    fn a_break_is_closed_beside_the_seam_and_after_the_displacement_before() {
+        let views = [view(-0.2), view(0.2)];
+        let layout = layout(&alignment(&views), Projection::Cylindrical, &Framing::default(), 1.0, 1_000_000).unwrap();
+        let common = layout.placements[0].bounds.intersection(&layout.placements[1].bounds).unwrap();
+        let middle = Point2::new(0.5 * (common.left + common.right) as f64, 0.5 * (common.top + common.bottom) as f64);
+        // A seam along a row, on a preview of half the size: an object 40 px wide is displaced by 8 and −2 px, beyond 10 px beside it nothing.
+        let off = Vector2::new(4.0, -1.0);
+        let tie = |x: f64, displacement| {
+            let at = Scaling::uniform(0.5).point(middle + Vector2::new(x, 0.0));
+            SeamTie { p: 0, q: 1, at, displacement }
+        };
+        let object = (-10..=10).map(|i| tie(2.0 * f64::from(i), off));
+        let beside = (15..25)
+            .flat_map(|i| [tie(2.0 * f64::from(i), Vector2::zeros()), tie(-2.0 * f64::from(i), Vector2::zeros())]);
+        let ties: Vec<SeamTie> = object.chain(beside).collect();
+        let mut before: Vec<Option<DisplacementField>> =
+            layout.placements.iter().map(|p| Some(DisplacementField::over(&p.bounds, 9.0))).collect();
+        let constant = Vector2::new(1.5, 0.5);
+        before[0].as_mut().unwrap().displacement.fill(constant);
+        let fields = close_breaks(&before, &ties, 2, &layout, &stage()).unwrap();
+        let difference =
+            |at: Point2<f64>| fields[0].as_ref().unwrap().at(at) - constant - fields[1].as_ref().unwrap().at(at);
+        // Smoothness takes a tenth of a step between objects a grid cell or two apart.
+        assert!((difference(middle) - 2.0 * off).norm() < 0.8, "{}", difference(middle));
+        for x in [-45.0, 45.0] {
+            assert!(difference(middle + Vector2::new(x, 0.0)).norm() < 0.8, "{x}");
+        }
+        for y in [-75.0, 75.0] {
+            // Two distances of decay away.
+            assert!(difference(middle + Vector2::new(0.0, y)).norm() < off.norm(), "{y}");
         }
     }
 
@@ -731,12 +805,12 @@ mod tests {
         let rows = (common.top + 10..common.bottom - 10).step_by(10);
         let ties: Vec<TiePoint> = rows
             .map(|y| Point2::new(common.left as f64 + 5.0, y as f64))
-            .map(|a| TiePoint { p: left, q: other, a, b: a + Vector2::new(3.0, -2.0), normal: None })
+            .map(|a| TiePoint::point(left, other, a, a + Vector2::new(3.0, -2.0), None))
             .collect();
         let step = |continuity: &[TiePoint]| -> f64 {
             let mut fields: Vec<_> =
                 layout.placements.iter().map(|p| DisplacementField::over(&p.bounds, 10.0)).collect();
-            solve(&mut fields, &ties, continuity, 3.0, &stage()).unwrap();
+            solve(&mut fields, &ties, continuity, DAMPING, LOSS_SCALE, &stage()).unwrap();
             let steps =
                 super::border_ties(&layout, 10.0).into_iter().map(|t| fields[t.p].at(t.a) - fields[t.q].at(t.b));
             steps.map(|v| v.norm()).fold(0.0, f64::max)
@@ -771,9 +845,9 @@ mod tests {
         let at = |x: f64, y: f64| Point2::new(x, y);
         let ties: Vec<TiePoint> = (0..40)
             .map(|k| at(20.0 + 20.0 * f64::from(k % 8), 10.0 + 18.0 * f64::from(k / 8)))
-            .map(|a| TiePoint { p: 0, q: 1, a, b: a + Vector2::new(3.0, 7.0), normal: Some(Vector2::x()) })
+            .map(|a| TiePoint::point(0, 1, a, a + Vector2::new(3.0, 7.0), Some(Vector2::x())))
             .collect();
-        solve(&mut fields, &ties, &[], 3.0, &stage()).unwrap();
+        solve(&mut fields, &ties, &[], DAMPING, LOSS_SCALE, &stage()).unwrap();
         let apart = fields[0].at(at(100.0, 50.0)) - fields[1].at(at(100.0, 50.0));
         // The damping, 0.006 a vertex, takes a hundredth of it.
         assert!((apart.x - 3.0).abs() < 0.1 && apart.y.abs() < 1e-6, "{apart}");

@@ -20,11 +20,11 @@ mod structure_tensor;
 mod warp;
 
 pub use bounds::Bounds;
-pub(crate) use correlation::{PAD, SEARCH_RADIUS, SEARCH_SIDE, Template};
+pub(crate) use correlation::{PAD, SEARCH_RADIUS, SEARCH_SIDE, Template, parabola_peak, score_maximum};
 pub(crate) use crop::{largest_rectangle, largest_rectangle_of};
 pub(crate) use displacement::DisplacementField;
 pub use displacement::PhotoMap;
-pub(crate) use elastic::{ROUND_UNITS, displacements, displacements_with};
+pub(crate) use elastic::{ROUND_UNITS, SeamTie, close_breaks, displacements, displacements_with, max_displacement};
 pub use framing::Framing;
 pub use layout::{Canvas, LayoutError};
 pub(crate) use layout::{Layout, Placement, layout};
