@@ -47,10 +47,10 @@ pub(crate) struct Globals {
     /// Threads to use [default: one per core]. The result is the same for any number.
     #[arg(long, global = true, value_name = "N", value_parser = value_parser!(u16).range(1..=1024))]
     pub(crate) threads: Option<u16>,
-    /// Memory limit in MiB: for reading one file, by its header [default: half of the machine's], for stereo matching, which is split
+    /// Memory limit in MiB, or with a unit (512M, 2G): for reading one file, by its header [default: half of the machine's], for stereo matching, which is split
     /// into overlapping strips of rows beyond it [default: unlimited; 1024 for a dense cloud], and for panoramas, which are then made from photographs
     /// read when needed and written in strips of rows, with the same pixels.
-    #[arg(long, global = true, value_name = "MIB", value_parser = value_parser!(u32).range(1..))]
+    #[arg(long, global = true, value_name = "SIZE", value_parser = memory::mebibytes)]
     pub(crate) max_memory: Option<u32>,
     /// Seed of the random number generator [default: fixed per job]. The same seed gives the same result; commands without random sampling
     /// refuse it.
