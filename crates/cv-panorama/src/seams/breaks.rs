@@ -2,8 +2,8 @@
 //! preview; local alignment then closes the break.
 
 use crate::blend::NO_PHOTO;
-use crate::seams::misalignment::{PATCH_RADIUS, has_contrast, luma, patch_rows};
-use crate::surface::{Piece, Preview, SeamTie, Template, score_maximum};
+use crate::seams::misalignment::{PATCH_RADIUS, PATCH_SIDE, has_contrast, luma, patch_rows, patch_template};
+use crate::surface::{Piece, Preview, SeamTie, score_maximum};
 use cv_core::{Cancelled, GrayF32, Image, Point2, Stage, UnionFind, Vector2};
 use cv_parallel::prelude::*;
 
@@ -21,7 +21,7 @@ const MAX_CONTINUOUS: f32 = 8.0;
 /// Maximum difference of the displaced patches relative to the visibility of the break.
 const MAX_REMAINING: f32 = 0.6;
 /// Minimum number of seam pixels of a break, the side of a patch: those of fewer have a common pixel.
-const MIN_PIXELS: usize = 2 * PATCH_RADIUS + 1;
+const MIN_PIXELS: usize = PATCH_SIDE;
 /// Difference, in preview pixels along each axis, up to which neighboring seam pixels have the same displacement.
 const SAME_DISPLACEMENT: f64 = 1.0;
 /// Every how many continuous seam pixels keep the photographs where they are: together they weigh less than a break.
@@ -165,16 +165,11 @@ fn displacement(
     site: Site,
     max_displacement: usize,
 ) -> Option<(Vector2<f64>, f32)> {
-    const SIDE: usize = 2 * PATCH_RADIUS + 1;
     let position = |k: usize, (dx, dy): (isize, isize)| {
         let b = pieces[k].warped.bounds;
         (site.x as isize - b.left as isize + dx, site.y as isize - b.top as isize + dy)
     };
-    let mut ours = [0.0_f32; SIDE * SIDE];
-    for (to, from) in ours.chunks_exact_mut(SIDE).zip(patch_rows(&lumas[site.p], position(0, (0, 0)))?) {
-        to.copy_from_slice(from);
-    }
-    let template = Template::new(SIDE, &ours);
+    let template = patch_template(&lumas[site.p], position(0, (0, 0)))?;
     if !has_contrast(&template) {
         return None;
     }
@@ -191,7 +186,7 @@ fn displacement(
     };
     let scores: Vec<f32> = (-reach..=reach).flat_map(|dy| (-reach..=reach).map(move |dx| score(dx, dy))).collect();
     let displacement = score_maximum(&scores, 2 * max_displacement + 1, MIN_CORRELATION.max(present + MIN_GAIN))?;
-    Some((displacement, (template.energy() / (SIDE * SIDE) as f32).sqrt()))
+    Some((displacement, (template.energy() / (PATCH_SIDE * PATCH_SIDE) as f32).sqrt()))
 }
 
 /// Returns the mean difference of the patches, in gray levels, at a displacement.

@@ -7,6 +7,8 @@ use cv_parallel::prelude::*;
 
 /// Patch radius in preview pixels.
 pub(super) const PATCH_RADIUS: usize = 4;
+/// Side of a patch.
+pub(super) const PATCH_SIDE: usize = 2 * PATCH_RADIUS + 1;
 /// Grid spacing of the patches in preview pixels.
 const SPACING: usize = 3;
 /// Minimum root mean square contrast of a patch, in gray levels: low-texture patches are skipped.
@@ -110,16 +112,10 @@ fn extend_to_borders(pixels: &mut [f32], columns: usize) {
 /// Computes the smallest displacement at which the patch around `p` matches that around `q`: 0 for low texture, [`SEARCH_RADIUS`] without a match, NaN where one
 /// of the patches is not complete.
 fn displacement(first: &GrayF32, p: (isize, isize), second: &GrayF32, q: (isize, isize)) -> f32 {
-    const SIDE: usize = 2 * PATCH_RADIUS + 1;
-    let mut patch = [0.0_f32; SIDE * SIDE];
-    let (Some(ours), Some(theirs)) = (patch_rows(first, p), patch_rows(second, q)) else { return f32::NAN };
+    let (Some(template), Some(theirs)) = (patch_template(first, p), patch_rows(second, q)) else { return f32::NAN };
     if theirs.clone().flatten().any(|v| v.is_nan()) {
         return f32::NAN;
     }
-    for (to, from) in patch.chunks_exact_mut(SIDE).zip(ours) {
-        to.copy_from_slice(from);
-    }
-    let template = Template::new(SIDE, &patch);
     if template.energy().is_nan() {
         return f32::NAN;
     }
@@ -130,7 +126,7 @@ fn displacement(first: &GrayF32, p: (isize, isize), second: &GrayF32, q: (isize,
         return 0.0;
     }
     // NaN outside the photograph, as are the scores there.
-    const WIDE: usize = SIDE + 2 * SEARCH_RADIUS;
+    const WIDE: usize = PATCH_SIDE + 2 * SEARCH_RADIUS;
     let mut window = [f32::NAN; WIDE * WIDE + PAD];
     let reach = (PATCH_RADIUS + SEARCH_RADIUS) as isize;
     let (w, h) = (second.width() as isize, second.height() as isize);
@@ -153,8 +149,16 @@ fn displacement(first: &GrayF32, p: (isize, isize), second: &GrayF32, q: (isize,
 
 /// Returns whether a patch has enough texture to be compared; false where it contains NaN.
 pub(super) fn has_contrast(patch: &Template) -> bool {
-    const PIXELS: usize = (2 * PATCH_RADIUS + 1) * (2 * PATCH_RADIUS + 1);
-    patch.energy() >= PIXELS as f32 * MIN_CONTRAST * MIN_CONTRAST
+    patch.energy() >= (PATCH_SIDE * PATCH_SIDE) as f32 * MIN_CONTRAST * MIN_CONTRAST
+}
+
+/// Returns the patch around a pixel as a template; `None` where it is not complete.
+pub(super) fn patch_template(image: &GrayF32, at: (isize, isize)) -> Option<Template> {
+    let mut patch = [0.0_f32; PATCH_SIDE * PATCH_SIDE];
+    for (to, from) in patch.chunks_exact_mut(PATCH_SIDE).zip(patch_rows(image, at)?) {
+        to.copy_from_slice(from);
+    }
+    Some(Template::new(PATCH_SIDE, &patch))
 }
 
 /// Returns the rows of the patch around a pixel; `None` where it is not complete.

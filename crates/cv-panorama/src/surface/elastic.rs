@@ -9,6 +9,7 @@ use crate::align::Alignment;
 use crate::masks::{PhotoMask, is_removed, is_removed_near};
 use crate::surface::correlation::AMBIGUITY;
 use crate::surface::structure_tensor::StructureTensor;
+use crate::surface::tie_points::{TiePoint, solve};
 use crate::surface::{
     DisplacementField, Layout, PAD, Placement, SEARCH_RADIUS, SEARCH_SIDE, Surface, Template, parabola_peak,
     score_maximum,
@@ -19,47 +20,12 @@ use cv_parallel::prelude::*;
 use fearless_simd::{Level, dispatch};
 use std::ops::Deref;
 
-/// A correspondence of two placements: the difference of their displacements at two canvas positions.
-#[derive(Clone, Copy)]
-struct TiePoint {
-    p: usize,
-    q: usize,
-    a: Point2<f64>,
-    b: Point2<f64>,
-    /// Displacement of `p` at `a` minus that of `q` at `b`.
-    difference: Vector2<f64>,
-    /// Unit normal of the edge, where the position along it is unknown (aperture problem).
-    normal: Option<Vector2<f64>>,
-}
-
-impl TiePoint {
-    /// A point of the scene that the placements show at these canvas positions before displacement.
-    fn point(p: usize, q: usize, a: Point2<f64>, b: Point2<f64>, normal: Option<Vector2<f64>>) -> Self {
-        Self { p, q, a, b, difference: b - a, normal }
-    }
-
-    /// Returns the component of a displacement that the tie point measures.
-    fn measured(normal: Option<Vector2<f64>>, v: Vector2<f64>) -> Vector2<f64> {
-        normal.map_or(v, |n| n * n.dot(&v))
-    }
-}
-
 /// Grid cells along the side of a photograph.
 const CELLS: f64 = 24.0;
-/// Weight of the smoothness term relative to a tie point.
-const SMOOTHNESS: f64 = 0.15;
-/// Weight of the damping term: a displacement decays over √(SMOOTHNESS / DAMPING) = 5 cells, a fifth of a photograph.
+/// Weight of the damping term: a displacement decays over the root of the ratio to the weight of smoothness, 5 cells, a fifth of a photograph.
 const DAMPING: f64 = 0.006;
 /// Scale of the robust loss in canvas pixels: feature positions have errors of up to a pixel, registered patches of a fraction.
 const LOSS_SCALE: f64 = 3.0;
-/// Weight of the continuity of a photograph across the border of a canvas that spans 360°, relative to a tie point: dominates the tie points of a cell.
-const CONTINUITY: f64 = 30.0;
-/// Rounds of iteratively reweighted least squares.
-const ROUNDS: u32 = 5;
-/// Tolerance of the conjugate gradients in the last round: a thousandth of a pixel.
-const TOLERANCE: f64 = 1e-8;
-/// Tolerance in the rounds before, whose weights are of a wider loss.
-const ROUND_TOLERANCE: f64 = 1e-4;
 /// How much finer the grid is on which the breaks at seams are closed.
 const REFINEMENT: f64 = 2.0;
 /// Displacement in canvas pixels up to which a photograph counts as not displaced: invisible.
@@ -102,8 +68,7 @@ where
     G: Deref<Target = GrayU8> + Sync,
     E: From<Cancelled> + Send,
 {
-    let side = layout.typical_side();
-    let spacing = (side / CELLS).max(8.0);
+    let spacing = grid_spacing(layout);
     let mut fields: Vec<_> = layout.placements.iter().map(|p| DisplacementField::over(&p.bounds, spacing)).collect();
     let mut ties = feature_ties(layout, alignment, max_displacement(layout), stage)?;
     ties.retain(|t| !is_removed(masks, layout, t.p, t.a) && !is_removed(masks, layout, t.q, t.b));
@@ -126,6 +91,11 @@ where
         field.update_source_shift(placement, &layout.surface);
     }
     Ok(fields.into_iter().map(Some).collect())
+}
+
+/// Returns the distance between vertices of the grid, in canvas pixels.
+fn grid_spacing(layout: &Layout) -> f64 {
+    (layout.typical_side() / CELLS).max(8.0)
 }
 
 /// Returns the maximum displacement between two photographs, in canvas pixels.
@@ -151,7 +121,7 @@ pub(crate) fn close_breaks(
     stage: &Stage<'_>,
 ) -> Result<Vec<Option<DisplacementField>>, Cancelled> {
     // A finer grid: objects are narrower than the overlap.
-    let spacing = (layout.typical_side() / (CELLS * REFINEMENT)).max(4.0);
+    let spacing = grid_spacing(layout) / REFINEMENT;
     let mut closing: Vec<_> = layout.placements.iter().map(|p| DisplacementField::over(&p.bounds, spacing)).collect();
     let scale = step as f64;
     let tie = |tie: &SeamTie| {
@@ -228,139 +198,6 @@ fn border_ties(layout: &Layout, spacing: f64) -> Vec<TiePoint> {
         }
     }
     ties
-}
-
-/// Solves for the fields by iteratively reweighted least squares (Cauchy weights of `scale` pixels, infinite for least squares) and conjugate gradients; `continuity` are positions at which two fields are equal.
-fn solve(
-    fields: &mut [DisplacementField],
-    ties: &[TiePoint],
-    continuity: &[TiePoint],
-    damping: f64,
-    scale: f64,
-    stage: &Stage<'_>,
-) -> Result<(), Cancelled> {
-    let mut offsets = vec![0];
-    for f in fields.iter() {
-        offsets.push(offsets[offsets.len() - 1] + f.displacement.len());
-    }
-    let n = offsets[fields.len()];
-    /// A residual: eight vertices with signed weights, the displacement to be compensated, and the direction in which it is known.
-    type Term = ([(usize, f64); 8], Vector2<f64>, Option<Vector2<f64>>);
-    let vertices = |t: &TiePoint| {
-        let (a, b) = (fields[t.p].around(t.a), fields[t.q].around(t.b));
-        let term = |k: usize| {
-            if k < 4 { (offsets[t.p] + a[k].0, a[k].1) } else { (offsets[t.q] + b[k - 4].0, -b[k - 4].1) }
-        };
-        std::array::from_fn(term)
-    };
-    let terms: Vec<Term> = ties.iter().chain(continuity).map(|t| (vertices(t), t.difference, t.normal)).collect();
-    let mut edges = Vec::new();
-    for (f, offset) in fields.iter().zip(&offsets) {
-        for y in 0..f.rows {
-            for x in 0..f.columns {
-                let i = offset + y * f.columns + x;
-                if x + 1 < f.columns {
-                    edges.push((i, i + 1));
-                }
-                if y + 1 < f.rows {
-                    edges.push((i, i + f.columns));
-                }
-            }
-        }
-    }
-    let mut d: Vec<Vector2<f64>> = fields.iter().flat_map(|f| f.displacement.iter().copied()).collect();
-    let left = |d: &[Vector2<f64>], t: &[(usize, f64); 8]| -> Vector2<f64> { t.iter().map(|&(i, w)| d[i] * w).sum() };
-    let rounds = if scale.is_finite() { ROUNDS } else { 1 };
-    for round in 0..rounds {
-        // The scale shrinks from round to round (graduated non-convexity).
-        let scale = scale * f64::from(1 << (rounds - 1 - round));
-        let weight = |(t, want, normal): &Term| {
-            let residual = TiePoint::measured(*normal, left(&d, t) - want);
-            1.0 / (1.0 + residual.norm_squared() / (scale * scale))
-        };
-        let weights = terms[..ties.len()].iter().map(weight);
-        let weights: Vec<f64> = weights.chain(continuity.iter().map(|_| CONTINUITY)).collect();
-        let apply = |x: &[Vector2<f64>]| {
-            let mut out: Vec<Vector2<f64>> = x.iter().map(|v| v * damping).collect();
-            for &(i, j) in &edges {
-                let pull = (x[i] - x[j]) * SMOOTHNESS;
-                out[i] += pull;
-                out[j] -= pull;
-            }
-            for ((t, _, normal), w) in terms.iter().zip(&weights) {
-                let value = TiePoint::measured(*normal, left(x, t) * *w);
-                for &(i, c) in t {
-                    out[i] += value * c;
-                }
-            }
-            out
-        };
-        let mut right = vec![Vector2::zeros(); n];
-        let mut diagonal = vec![Vector2::repeat(damping); n];
-        for &(i, j) in &edges {
-            diagonal[i] += Vector2::repeat(SMOOTHNESS);
-            diagonal[j] += Vector2::repeat(SMOOTHNESS);
-        }
-        for ((t, want, normal), w) in terms.iter().zip(&weights) {
-            let want = TiePoint::measured(*normal, *want);
-            let axes = normal.map_or_else(|| Vector2::repeat(1.0), |n| n.component_mul(&n));
-            for &(i, c) in t {
-                right[i] += want * (c * w);
-                diagonal[i] += axes * (c * c * w);
-            }
-        }
-        let tolerance = if round + 1 < rounds { ROUND_TOLERANCE } else { TOLERANCE };
-        conjugate_gradients(apply, &right, &diagonal, &mut d, tolerance, stage)?;
-    }
-    for (f, offset) in fields.iter_mut().zip(&offsets) {
-        let len = f.displacement.len();
-        f.displacement.copy_from_slice(&d[*offset..offset + len]);
-    }
-    Ok(())
-}
-
-/// Solves by conjugate gradients with Jacobi preconditioner, starting from `x`; ends at a squared residual of `tolerance` relative to the right-hand side, since
-/// the initial residual may be small.
-fn conjugate_gradients(
-    apply: impl Fn(&[Vector2<f64>]) -> Vec<Vector2<f64>>,
-    right: &[Vector2<f64>],
-    diagonal: &[Vector2<f64>],
-    x: &mut [Vector2<f64>],
-    tolerance: f64,
-    stage: &Stage<'_>,
-) -> Result<(), Cancelled> {
-    let dot = |a: &[Vector2<f64>], b: &[Vector2<f64>]| -> f64 { a.iter().zip(b).map(|(a, b)| a.dot(b)).sum() };
-    let scaled =
-        |r: &[Vector2<f64>]| -> Vec<Vector2<f64>> { r.iter().zip(diagonal).map(|(r, d)| r.component_div(d)).collect() };
-    let product = apply(x);
-    let mut r: Vec<Vector2<f64>> = right.iter().zip(&product).map(|(b, a)| b - a).collect();
-    let mut z = scaled(&r);
-    let mut direction = z.clone();
-    let mut rz = dot(&r, &z);
-    let whole = dot(right, &scaled(right));
-    for iteration in 0..200 {
-        // An iteration on a hundred thousand matches is some milliseconds.
-        if iteration % 8 == 0 {
-            stage.check()?;
-        }
-        if rz <= tolerance * whole.max(1e-6) {
-            break;
-        }
-        let product = apply(&direction);
-        let step = rz / dot(&direction, &product).max(1e-300);
-        for i in 0..x.len() {
-            x[i] += direction[i] * step;
-            r[i] -= product[i] * step;
-        }
-        z = scaled(&r);
-        let next = dot(&r, &z);
-        let keep = next / rz.max(1e-300);
-        for (p, z) in direction.iter_mut().zip(&z) {
-            *p = z + *p * keep;
-        }
-        rz = next;
-    }
-    Ok(())
 }
 
 /// Patch radius in canvas pixels.
@@ -586,6 +423,7 @@ fn register_edge(first: &[f32], second: &[f32]) -> Option<f64> {
 
 /// Minimum correlation of registered patches.
 const MIN_CORRELATION: f32 = 0.85;
+
 /// Estimates the displacement of `first` in the larger window `second` by normalized cross-correlation with parabolic sub-pixel interpolation; `None` for a low
 /// or ambiguous maximum.
 fn register(first: &[f32], mut second: Vec<f32>) -> Option<Vector2<f64>> {
@@ -601,7 +439,7 @@ mod tests {
     use crate::surface::{Bounds, Framing, PhotoMap, Projection, layout};
     use crate::testing::{StopAt, photograph, sky, stage};
     use cv_core::{Camera, Correspondence, Silent, Vector3};
-    use nalgebra::{DMatrix, DVector, Rotation3};
+    use nalgebra::Rotation3;
 
     fn view(yaw: f64) -> View {
         let turn = Rotation3::from_axis_angle(&Vector3::y_axis(), -yaw);
@@ -729,35 +567,6 @@ mod tests {
         // A direction maps to one canvas position.
         assert!((ties[0].a - ties[0].b).norm() < 1e-9 && (ties[0].p, ties[0].q) == (0, 1));
         assert_eq!(feature_ties(&layout, &set, 40.0, &stage()).unwrap().len(), 2);
-    }
-
-    #[test]
-    fn conjugate_gradients_converge_to_the_direct_solution() {
-        // A chain of springs of different strength, each vertex tied to zero.
-        let n = 40;
-        let mut matrix = DMatrix::<f64>::from_diagonal_element(n, n, 0.3);
-        for i in 0..n - 1 {
-            let k = 1.0 + (i % 7) as f64;
-            for (r, c, v) in [(i, i, k), (i + 1, i + 1, k), (i, i + 1, -k), (i + 1, i, -k)] {
-                matrix[(r, c)] += v;
-            }
-        }
-        let right: Vec<Vector2<f64>> =
-            (0..n).map(|i| Vector2::new((i as f64).sin(), (2.0 * i as f64).cos() * 10.0)).collect();
-        let apply = |x: &[Vector2<f64>]| -> Vec<Vector2<f64>> {
-            (0..n).map(|i| (0..n).map(|j| x[j] * matrix[(i, j)]).sum()).collect()
-        };
-        let diagonal: Vec<Vector2<f64>> = (0..n).map(|i| Vector2::repeat(matrix[(i, i)])).collect();
-        let mut x = vec![Vector2::new(0.5, -0.5); n];
-        conjugate_gradients(apply, &right, &diagonal, &mut x, TOLERANCE, &stage()).unwrap();
-        for axis in 0..2 {
-            let b = DVector::from_iterator(n, right.iter().map(|r| r[axis]));
-            let direct = matrix.clone().cholesky().unwrap().solve(&b);
-            for i in 0..n {
-                // Stops at 1e-4 of the right side in the norm of the matrix, whose least eigenvalue is 0.3.
-                assert!((x[i][axis] - direct[i]).abs() < 1e-3 * direct.amax(), "{i}");
-            }
-        }
     }
 
     #[test]

@@ -17,6 +17,7 @@ mod preview;
 mod spherical;
 mod stereographic;
 mod structure_tensor;
+mod tie_points;
 mod warp;
 
 pub use bounds::Bounds;
