@@ -48,10 +48,6 @@ mod plane_pose;
 mod rig_start;
 mod start;
 mod target;
-#[cfg(test)]
-mod testing;
-#[cfg(test)]
-mod tests;
 mod uncertainty;
 mod verdict;
 mod zhang;

@@ -1,6 +1,7 @@
-//! Synthetic two-view scenes with known pose, for tests.
+//! Synthetic two-view scenes with known pose, and known homographies, for tests. Also part of `tests/estimators`.
 
-use cv_core::{Camera, Correspondence, Matrix3, Point3, Pose, Rotation3, Vector3};
+use cv_core::{Camera, Correspondence, Matrix3, Point2, Point3, Pose, Rotation3, Vector3};
+use proptest::prelude::*;
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 use std::cell::RefCell;
@@ -52,7 +53,7 @@ impl TwoViews {
     pub(crate) fn point(&self, plane: Option<Vector3<f64>>) -> (Point3<f64>, Correspondence) {
         let rng = &mut *self.rng.borrow_mut();
         loop {
-            let pixel = cv_core::Point2::new(640.0 * uniform(rng) - 0.5, 480.0 * uniform(rng) - 0.5);
+            let pixel = Point2::new(640.0 * uniform(rng) - 0.5, 480.0 * uniform(rng) - 0.5);
             let ray = self.camera.normalize(pixel).to_homogeneous();
             let depth = match plane {
                 Some(n) => 1.0 / n.dot(&ray),
@@ -66,7 +67,8 @@ impl TwoViews {
         }
     }
 
-    fn noisy(&self, m: Correspondence, noise: f64) -> Correspondence {
+    /// Adds noise to all four coordinates.
+    pub(crate) fn noisy(&self, m: Correspondence, noise: f64) -> Correspondence {
         let rng = &mut *self.rng.borrow_mut();
         let mut n = || noise * gauss(rng);
         Correspondence::new(m.a.x + n(), m.a.y + n(), m.b.x + n(), m.b.y + n())
@@ -75,12 +77,6 @@ impl TwoViews {
     /// Draws inlier matches in pixels.
     pub(crate) fn matches(&self, n: usize, noise: f64) -> Vec<Correspondence> {
         (0..n).map(|_| self.noisy(self.point(None).1, noise)).collect()
-    }
-
-    /// Draws inlier matches of points on one slanted plane.
-    pub(crate) fn planar_matches(&self, n: usize, noise: f64) -> Vec<Correspondence> {
-        let plane = Vector3::new(0.03, -0.02, 0.125);
-        (0..n).map(|_| self.noisy(self.point(Some(plane)).1, noise)).collect()
     }
 
     /// Draws outlier matches, uniformly in both images.
@@ -98,10 +94,35 @@ impl TwoViews {
     pub(crate) fn normalize(&self, m: &Correspondence) -> Correspondence {
         Correspondence { a: self.camera.normalize(m.a), b: self.camera.normalize(m.b) }
     }
+}
 
-    /// Computes the RMS Sampson distance of new exact matches from `f`, in pixels.
-    pub(crate) fn exact_rms(&self, f: &Matrix3<f64>) -> f64 {
-        let m = self.matches(100, 0.0);
-        (m.iter().map(|m| crate::sampson(f, m).powi(2)).sum::<f64>() / 100.0).sqrt()
-    }
+/// Maps a point by a homography.
+pub(crate) fn map(h: &Matrix3<f64>, x: f64, y: f64) -> (f64, f64) {
+    let q = h * Point2::new(x, y).to_homogeneous();
+    (q.x / q.z, q.y / q.z)
+}
+
+/// Homographies of images of 640 × 480: rotation, scale, shear, shift and perspective. H[2][2] = 1.
+pub(crate) fn a_homography() -> impl Strategy<Value = Matrix3<f64>> {
+    (-3.0..3.0f64, 0.4..2.5f64, -0.3..0.3f64, -200.0..200.0f64, -200.0..200.0f64, -4e-4..4e-4f64, -4e-4..4e-4f64)
+        .prop_map(|(turn, scale, shear, tx, ty, px, py)| {
+            let (s, c) = turn.sin_cos();
+            Matrix3::new(scale * c, scale * (shear * c - s), tx, scale * s, scale * (shear * s + c), ty, px, py, 1.0)
+        })
+}
+
+/// Draws points of 640 × 480 px and maps them, with noise in both images.
+pub(crate) fn homography_matches(h: &Matrix3<f64>, n: usize, noise: f64, rng: &mut ChaCha8Rng) -> Vec<Correspondence> {
+    (0..n)
+        .map(|_| {
+            let (x, y) = (640.0 * uniform(rng), 480.0 * uniform(rng));
+            let (u, v) = map(h, x, y);
+            Correspondence::new(
+                x + noise * gauss(rng),
+                y + noise * gauss(rng),
+                u + noise * gauss(rng),
+                v + noise * gauss(rng),
+            )
+        })
+        .collect()
 }

@@ -342,6 +342,3 @@ fn decode_info(bytes: &[u8]) -> Result<((usize, usize), ExifInfo), FormatError> 
     let (width, height) = (header.width, header.height);
     Ok((if exif.orientation >= 5 { (height, width) } else { (width, height) }, exif))
 }
-
-#[cfg(test)]
-mod tests;

@@ -160,37 +160,6 @@ pub fn write_together<E: From<IoError>>(
 mod tests {
     use super::*;
 
-    fn names(folder: &Path) -> Vec<String> {
-        let entries = fs::read_dir(folder).unwrap();
-        let mut names: Vec<_> = entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
-        names.sort();
-        names
-    }
-
-    #[test]
-    fn several_files_are_written_all_or_none() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path();
-        let write = |text: &'static str, fails: bool| {
-            write_together(path, &["a", "b"], |temporary| -> Result<(), IoError> {
-                crate::write_bytes(temporary.join("a"), text.as_bytes())?;
-                if fails {
-                    return Err(IoError::writing(path, FormatError::Empty));
-                }
-                crate::write_bytes(temporary.join("b"), text.as_bytes())
-            })
-        };
-        assert!(write("first", true).is_err() && names(path).is_empty());
-        write("second", false).unwrap();
-        assert!(write("third", true).is_err());
-        assert_eq!(names(path), ["a", "b"]);
-        assert_eq!(fs::read(path.join("a")).unwrap(), b"second");
-        fs::remove_file(path.join("b")).unwrap();
-        fs::create_dir(path.join("b")).unwrap();
-        assert!(write("fourth", false).is_err());
-        assert_eq!(fs::read(path.join("a")).unwrap(), b"second");
-    }
-
     #[test]
     fn a_write_is_registered_until_it_is_finished() {
         let folder = tempfile::tempdir().unwrap();
@@ -207,25 +176,5 @@ mod tests {
         // The registry is locked while the file is moved.
         assert!(pending.finish(|| PENDING_PATHS.try_lock().is_err()) && !known());
         assert!(PendingWrite::make(|| Err::<PathBuf, _>(io::Error::other("no")), |path| path).is_err());
-    }
-
-    #[cfg(unix)]
-    #[test]
-    fn only_abandoned_writes_are_removed() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = |name: &str| folder.path().join(name);
-        for name in [".cv-dead.part", ".cv-busy.part", ".x.part", ".cv-other", "result.png"] {
-            fs::write(path(name), "half").unwrap();
-        }
-        fs::create_dir(path(".cv-several.part")).unwrap();
-        fs::write(path(".cv-several.part/left.png"), "half").unwrap();
-        // Locks belong to the open file: a second handle simulates another process.
-        let busy = File::open(path(".cv-busy.part")).unwrap();
-        busy.lock().unwrap();
-        remove_abandoned(folder.path());
-        assert_eq!(names(folder.path()), [".cv-busy.part", ".cv-other", ".x.part", "result.png"]);
-        drop(busy);
-        remove_abandoned(folder.path());
-        assert_eq!(names(folder.path()), [".cv-other", ".x.part", "result.png"]);
     }
 }

@@ -76,7 +76,7 @@ impl Scorer for Cauchy {
 #[test]
 fn images_are_matched_by_a_custom_descriptor_and_loss() {
     let camera = Camera::from_focal(640, 480, 520.0);
-    let pair = homography_pair(2, &camera, 0.15, &RenderOptions::default()).unwrap();
+    let pair = homography_pair(2, &camera, 0.15, &RenderOptions::draft()).unwrap();
     let found = match_photos(pair.a.image.view(), pair.b.image.view(), &with_gray_corners(), &Silent).unwrap();
     assert!(found.features.iter().all(|f| f.descriptors.kind() == GRAY));
     let kind = ModelKind::Homography;
@@ -92,7 +92,7 @@ fn images_are_matched_by_a_custom_descriptor_and_loss() {
 #[test]
 fn two_views_and_a_panorama_use_a_custom_descriptor() {
     let camera = Camera::from_focal(640, 480, 520.0);
-    let views = two_view(3, &camera, 0.25, &RenderOptions::default()).unwrap();
+    let views = two_view(3, &camera, 0.25, &RenderOptions::draft()).unwrap();
     let mut options =
         ReconstructOptions { matching: with_gray_corners(), ..ReconstructOptions::new(Intrinsics::Known([camera; 2])) };
     options.two_view.robust.scoring = Scoring::Other(&Cauchy);
@@ -104,7 +104,7 @@ fn two_views_and_a_panorama_use_a_custom_descriptor() {
     assert!(turn < 0.4 && way < 2.0 && found.scene.points.len() >= 60, "{turn} {way} {}", found.scene.points.len());
 
     let few = cv_synth::PanoramaSetOptions { views: 3, ..cv_synth::PanoramaSetOptions::default() };
-    let set = panorama_views(1, &camera, &few, &RenderOptions::default()).unwrap();
+    let set = panorama_views(1, &camera, &few, &RenderOptions::draft()).unwrap();
     let photos: Vec<_> = set.views.iter().map(|v| PanoramaPhoto::new(v.image.view())).collect();
     let options = PanoramaOptions { matching: with_gray_corners(), ..PanoramaOptions::default() };
     let joined = panorama(&photos, &options, &Silent).unwrap();
@@ -139,7 +139,7 @@ impl DisparityMatcher<u8, 3> for Oracle {
 fn depth_uses_a_custom_matcher() {
     let scene = Scene::room(1);
     let camera = Camera::from_focal(320, 240, 280.0);
-    let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap();
+    let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::draft()).unwrap();
     let geometry = StereoGeometry::from_focal(320, 240, 280.0, 0.25).unwrap();
     let (left, right) = (pair.left.image.view(), pair.right.image.view());
     let all = (0.0, f32::INFINITY);

@@ -9,7 +9,7 @@ use std::sync::LazyLock;
 static PAIR: LazyLock<StereoPair> = LazyLock::new(|| {
     let scene = Scene::room(5);
     let camera = Camera::from_focal(240, 180, 210.0);
-    stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::default()).unwrap()
+    stereo_pair(&scene, &camera, &scene.viewpoint(), 0.25, &RenderOptions::draft()).unwrap()
 });
 
 /// Writes [`PAIR`] as files to a new folder.

@@ -393,6 +393,3 @@ fn checked(camera: Camera) -> Result<Camera, FormatError> {
 fn no_size(format: &'static str) -> FormatError {
     FormatError::missing(format, "image size")
 }
-
-#[cfg(test)]
-mod tests;

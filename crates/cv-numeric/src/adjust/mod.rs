@@ -46,8 +46,6 @@ mod residual;
 mod schedule;
 mod solve;
 mod structure;
-#[cfg(test)]
-mod tests;
 
 use crate::RobustLoss;
 pub use covariance::Covariance;

@@ -185,9 +185,6 @@ pub(super) trait ResidualKind: Send + Sync {
     fn add_to_point(&self, rows: &WeightedRows, incidence: &Incidence, slots: Range<usize>, point: PointSums<'_>);
     /// Adds the residuals (slots) that involve the columns of a task.
     fn add_to_columns(&self, rows: &WeightedRows, incidence: &Incidence, slots: &[u32], columns: ColumnSums<'_>);
-    /// Residual components of an item and their common weight, for the reference implementation.
-    #[cfg(test)]
-    fn reference(&self, values: &Values, item: usize) -> (Vec<f64>, f64);
 }
 
 /// A kind of residuals and the blocks that its items depend on.
@@ -349,12 +346,6 @@ impl<T: Residual<R, B, C>, const R: usize, const B: usize, const C: usize> Resid
             Ok(sums)
         };
         sum_in_order((0..self.len().div_ceil(ITEMS_PER_CHUNK)).into_par_iter().map(chunk).collect())
-    }
-
-    #[cfg(test)]
-    fn reference(&self, values: &Values, item: usize) -> (Vec<f64>, f64) {
-        let r = self.residual.evaluate(item, self.block_values(values, item), None).unwrap();
-        (r.as_slice().to_vec(), self.loss.weight(r.norm_squared()))
     }
 
     fn add_to_point(&self, rows: &WeightedRows, incidence: &Incidence, slots: Range<usize>, point: PointSums<'_>) {

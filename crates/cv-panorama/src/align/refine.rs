@@ -453,47 +453,7 @@ fn gauss_newton_step(level: Level, template: &Template, patch: &[f32; WIDE * STR
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{StopAt, photograph, sky};
-    use crate::{CameraMotion, VerifyOptions, verify_pair};
-    use cv_core::{Camera, Matrix3, Silent, Vector3};
-    use nalgebra::Rotation3;
-
-    fn views() -> Vec<View> {
-        let turn = |yaw: f64, roll: f64| {
-            Rotation3::from_axis_angle(&Vector3::z_axis(), roll) * Rotation3::from_axis_angle(&Vector3::y_axis(), -yaw)
-        };
-        [(-0.45, 0.02), (0.0, -0.01), (0.4, 0.03)]
-            .map(|(yaw, roll)| View {
-                camera: Camera::from_focal(320, 240, 300.0),
-                from_world: turn(yaw, roll).into_inner(),
-            })
-            .to_vec()
-    }
-
-    /// Luma of what the views show; the second is exposed differently.
-    fn images(views: &[View]) -> Vec<GrayU8> {
-        let image = |(i, view): (usize, &View)| {
-            let gain = if i == 1 { 0.7 } else { 1.0 };
-            cv_imgproc::rgb_to_gray(photograph(view, |ray| sky(ray).map(|v| gain * v + 5.0)).view())
-        };
-        views.iter().enumerate().map(image).collect()
-    }
-
-    /// Matches of what two views both show, each off by up to `error` pixels in either direction.
-    fn matches(from: &View, to: &View, error: f64) -> Vec<Correspondence> {
-        let mut state = 5_u32;
-        let mut noise = || {
-            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            error * (2.0 * f64::from(state >> 8) / f64::from(1 << 24) - 1.0)
-        };
-        let grid = (0..18)
-            .flat_map(|y| (0..24).map(move |x| Point2::new(12.0 + 12.7 * f64::from(x), 12.0 + 12.7 * f64::from(y))));
-        let mut shown = |a: Point2<f64>| {
-            let b = to.project(&from.ray(a)?).filter(|b| to.contains(*b))?;
-            Some(Correspondence { a: a + Vector2::new(noise(), noise()), b: b + Vector2::new(noise(), noise()) })
-        };
-        grid.filter_map(&mut shown).collect()
-    }
+    use crate::testing::{inexact_matches as matches, lumas as images, three_views as views};
 
     #[test]
     fn registered_matches_have_the_accepted_standard_error_across_exposures_and_rotations() {
@@ -531,41 +491,5 @@ mod tests {
         // Off by more than a correction may be.
         let far = Correspondence { b: m.b + Vector2::new(6.0, 0.0), ..m };
         assert_eq!(refine_match(Level::new(), [&images[0], &images[1]], &views[0], &views[1], &far), None);
-    }
-
-    #[test]
-    fn an_alignment_of_inexact_matches_is_refined() {
-        let truth = views();
-        let images = images(&truth);
-        let size = (320, 240);
-        let pairs: Vec<VerifiedPair> = [(0, 1), (1, 2)]
-            .map(|(i, j)| {
-                verify_pair((i, size), (j, size), &matches(&truth[i], &truth[j], 0.7), &VerifyOptions::default())
-                    .unwrap()
-            })
-            .to_vec();
-        let photos = vec![Photo::new(320, 240); 3];
-        let options = AlignOptions { motion: CameraMotion::Rotation, ..AlignOptions::default() };
-        let rough = align(&photos, &pairs, &options, &Silent).unwrap();
-        let refined = refine_alignment(&images, &photos, &pairs, rough.clone(), &options, &Silent).unwrap();
-        // Angle of the relative rotation of the outer two, and the focal length, against the truth.
-        let error = |found: &Alignment| {
-            let [a, b] = [0, 2].map(|i| found.views[i].unwrap());
-            let off: Matrix3<f64> = b.from_world
-                * a.from_world.transpose()
-                * (truth[2].from_world * truth[0].from_world.transpose()).transpose();
-            (Vector3::new(off[(2, 1)], off[(0, 2)], off[(1, 0)]).norm() * 300.0, (a.camera.fx - 300.0).abs())
-        };
-        let (before, after) = (error(&rough), error(&refined));
-        // Errors of up to 0.1 px in place of ±0.7 (0.4 of standard deviation) along each axis, of as many matches.
-        assert!(after.0 < 0.25 * before.0.max(0.5) && after.1 < 0.25 * before.1.max(0.5), "{before:?} {after:?}");
-        assert_eq!(refined.pairs.len(), rough.pairs.len());
-        assert_eq!(refined.pairs[0].matches, rough.pairs[0].matches);
-        // Without pixels nothing changes.
-        let blank = vec![GrayU8::new(320, 240, [9]); 3];
-        let same = refine_alignment(&blank, &photos, &pairs, rough.clone(), &options, &Silent).unwrap();
-        assert!((same.rms_px - rough.rms_px).abs() < 1e-3);
-        let stopped = refine_alignment(&images, &photos, &pairs, rough, &options, &StopAt::report(3));
-        assert_eq!(stopped.unwrap_err(), Cancelled);
     }
 }

@@ -110,9 +110,6 @@ const REMOVED: u8 = 1;
 const KEPT: u8 = 2;
 
 #[cfg(test)]
-mod tests;
-
-#[cfg(test)]
 mod mask_tests {
     use super::*;
     use proptest::prelude::*;

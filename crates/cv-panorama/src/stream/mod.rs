@@ -478,6 +478,3 @@ fn each_warped<T: PhotoSample>(
     }
     Ok(())
 }
-
-#[cfg(test)]
-mod tests;

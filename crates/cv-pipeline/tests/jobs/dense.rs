@@ -37,7 +37,7 @@ fn the_cloud_is_as_accurate_as_the_sparse_points() {
     bent.distortion = Distortion::radial(-0.12, 0.02);
     // The second camera is left or right of the first, and a little in front or behind, depending on the seed.
     for (seed, camera) in [(3, plain), (5, bent), (8, plain), (11, bent)] {
-        let views = two_view(seed, &camera, 0.4, &RenderOptions::default()).unwrap();
+        let views = two_view(seed, &camera, 0.4, &RenderOptions::draft()).unwrap();
         let sparse = sparse(&views, &camera);
         let (a, b) = (views.a.image.view(), views.b.image.view());
         let dense = reconstruct_dense(a, b, &sparse, &DenseOptions::default(), &Silent).unwrap();
@@ -76,7 +76,7 @@ fn the_cloud_is_as_accurate_as_the_sparse_points() {
 #[test]
 fn reduced_images_and_little_memory_give_the_same_scene() {
     let camera = Camera::from_focal(640, 480, 560.0);
-    let views = two_view(3, &camera, 0.4, &RenderOptions::default()).unwrap();
+    let views = two_view(3, &camera, 0.4, &RenderOptions::draft()).unwrap();
     let sparse = sparse(&views, &camera);
     let run = |options: &DenseOptions| {
         reconstruct_dense(views.a.image.view(), views.b.image.view(), &sparse, options, &Silent)
@@ -117,7 +117,7 @@ fn a_forward_motion_is_an_error_with_its_angle() {
     let first = scene.viewpoint();
     // 60 cm straight ahead: the epipole is at the center of both images.
     let second = Pose::new(first.rotation, first.translation - Vector3::new(0.03, 0.0, 0.6));
-    let photos = [first, second].map(|pose| render(&scene, &camera, &pose, &RenderOptions::default()).unwrap().image);
+    let photos = [first, second].map(|pose| render(&scene, &camera, &pose, &RenderOptions::draft()).unwrap().image);
     let options = ReconstructOptions::new(Intrinsics::Known([camera; 2]));
     let (a, b) = (photos[0].view(), photos[1].view());
     let sparse = reconstruct(a, b, &options, &Silent).unwrap();

@@ -22,7 +22,7 @@ fn camera() -> Camera {
 #[test]
 fn a_homographys_corners_are_within_three_tenths_of_a_pixel() {
     for seed in SEEDS {
-        let pair = homography_pair(seed, &camera(), 0.3, &RenderOptions::default()).unwrap();
+        let pair = homography_pair(seed, &camera(), 0.3, &RenderOptions::draft()).unwrap();
         let options = MatchingOptions::default();
         let found = match_photos(pair.a.image.view(), pair.b.image.view(), &options, &Silent).unwrap();
         let kind = ModelKind::Homography;
@@ -40,7 +40,7 @@ fn a_panorama_uses_every_photograph_and_aligns_within_a_fifth_of_a_pixel() {
         let camera = camera();
         // Every other set has a person who walks through.
         let walk = cv_synth::PanoramaSetOptions { walker: seed % 2 == 0, ..cv_synth::PanoramaSetOptions::default() };
-        let set = panorama_views(seed, &camera, &walk, &RenderOptions::default()).unwrap();
+        let set = panorama_views(seed, &camera, &walk, &RenderOptions::draft()).unwrap();
         let photos: Vec<_> = set.views.iter().map(|v| PanoramaPhoto::new(v.image.view())).collect();
         let result = panorama(&photos, &PanoramaOptions::default(), &Silent).unwrap();
         assert!(result.images.iter().all(|i| i.used), "seed {seed}: {:?}", result.images);
@@ -65,7 +65,7 @@ fn a_panorama_uses_every_photograph_and_aligns_within_a_fifth_of_a_pixel() {
 fn two_views_determine_rotation_and_translation_direction() {
     for seed in SEEDS {
         let camera = camera();
-        let pair = two_view(seed, &camera, 0.6, &RenderOptions::default()).unwrap();
+        let pair = two_view(seed, &camera, 0.6, &RenderOptions::draft()).unwrap();
         let known = Intrinsics::Known([camera; 2]);
         let options = ReconstructOptions::new(known);
         let found = reconstruct(pair.a.image.view(), pair.b.image.view(), &options, &Silent).unwrap();
@@ -100,7 +100,7 @@ fn two_views_determine_rotation_and_translation_direction() {
 fn a_ball_is_segmented_by_its_color() {
     // Eight photographs, each of a scene of its own: fewer seeds.
     for seed in 0..2 {
-        let photos = ball_photos(seed, 8, &camera(), &RenderOptions::default()).unwrap();
+        let photos = ball_photos(seed, 8, &camera(), &RenderOptions::draft()).unwrap();
         let half: Vec<_> = photos.iter().step_by(2).map(|p| (p.view.image.view(), p.mask.view())).collect();
         let model = train_segment(&half, &Default::default(), &Silent).unwrap().trained.model;
         let score = photos

@@ -22,7 +22,7 @@ fn is_bus(x: usize, y: usize) -> bool {
 fn photos() -> (PanoramaViews, Vec<RgbU8>) {
     let options = PanoramaSetOptions { views: 4, overlap: 0.6, ..PanoramaSetOptions::default() };
     let camera = Camera::from_focal(SIZE.0, SIZE.1, 390.0);
-    let set = panorama_views(6, &camera, &options, &RenderOptions::default()).unwrap();
+    let set = panorama_views(6, &camera, &options, &RenderOptions::draft()).unwrap();
     let block = |x: usize, y: usize| (((x / 6) * 7919 + (y / 6) * 104_729) % 251) as u8;
     let photo =
         |image: &RgbU8| {

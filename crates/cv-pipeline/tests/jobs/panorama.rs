@@ -22,7 +22,7 @@ fn join(photos: &[ImageView<'_, u8, 3>], options: &PanoramaOptions) -> Result<Pa
 
 fn views(seed: u64, count: usize) -> Vec<RgbU8> {
     let options = cv_synth::PanoramaSetOptions { views: count, ..cv_synth::PanoramaSetOptions::default() };
-    let set = panorama_views(seed, &camera(), &options, &RenderOptions::default()).unwrap();
+    let set = panorama_views(seed, &camera(), &options, &RenderOptions::draft()).unwrap();
     set.views.into_iter().map(|v| v.image).collect()
 }
 
@@ -55,7 +55,7 @@ fn views_with_parallax(seed: u64) -> (Scene, Vec<Rendered>) {
         let eye = Point3::new(0.06 * offset, 0.0, 0.0);
         let way = 0.5 * offset;
         let pose = Pose::look_at(eye, eye + Vector3::new(way.sin(), 0.0, way.cos()), Vector3::y()).unwrap();
-        render(&scene, &camera(), &pose, &RenderOptions::default().with_seed(seed ^ i as u64)).unwrap()
+        render(&scene, &camera(), &pose, &RenderOptions::draft().with_seed(seed ^ i as u64)).unwrap()
     });
     let taken = taken.collect();
     (scene, taken)
@@ -159,7 +159,7 @@ fn the_order_of_the_photographs_does_not_change_the_alignment() {
 fn a_calibrated_distortion_is_corrected() {
     let bent = Camera { distortion: Distortion::radial(-0.25, 0.05), ..camera() };
     let options = cv_synth::PanoramaSetOptions { views: 3, ..cv_synth::PanoramaSetOptions::default() };
-    let set = panorama_views(4, &bent, &options, &RenderOptions::default()).unwrap();
+    let set = panorama_views(4, &bent, &options, &RenderOptions::draft()).unwrap();
     let photos: Vec<_> =
         set.views.iter().map(|v| PanoramaPhoto { camera: Some(bent), ..PanoramaPhoto::new(v.image.view()) }).collect();
     let result = panorama(&photos, &PanoramaOptions::default(), &Silent).unwrap();

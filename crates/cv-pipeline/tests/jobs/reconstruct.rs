@@ -14,7 +14,7 @@ fn known() -> ReconstructOptions {
 
 #[test]
 fn a_room_is_reconstructed_with_its_pose_and_depths() {
-    let views = two_view(3, &camera(), 0.4, &RenderOptions::default()).unwrap();
+    let views = two_view(3, &camera(), 0.4, &RenderOptions::draft()).unwrap();
     let result = reconstruct(views.a.image.view(), views.b.image.view(), &known(), &Silent).unwrap();
     let turn = rotation_error(&result.scene.pose.rotation, &views.relative.rotation).to_degrees();
     let direction = direction_error(&result.scene.pose.translation, &views.relative.translation).to_degrees();
@@ -37,7 +37,7 @@ fn a_room_is_reconstructed_with_its_pose_and_depths() {
 fn unknown_focal_length_and_distortion_are_estimated() {
     let mut lens = camera();
     lens.distortion = cv_core::Distortion::radial(-0.15, 0.0);
-    let views = two_view(3, &lens, 0.4, &RenderOptions::default()).unwrap();
+    let views = two_view(3, &lens, 0.4, &RenderOptions::draft()).unwrap();
     let direction = |intrinsics| {
         let options = ReconstructOptions::new(intrinsics);
         let result = reconstruct(views.a.image.view(), views.b.image.view(), &options, &Silent).unwrap();
@@ -59,7 +59,7 @@ fn unknown_focal_length_and_distortion_are_estimated() {
 fn images_without_features_and_wrong_cameras_are_errors_with_their_numbers() {
     let flat = RgbU8::new(640, 480, [90; 3]);
     assert!(matches!(reconstruct(flat.view(), flat.view(), &known(), &Silent), Err(ReconstructError::Matching(_))));
-    let views = two_view(3, &camera(), 0.4, &RenderOptions::default()).unwrap();
+    let views = two_view(3, &camera(), 0.4, &RenderOptions::draft()).unwrap();
     let views = [&views.a.image, &views.b.image];
     let other = Camera::from_focal(320, 240, 560.0);
     let wrong = ReconstructOptions::new(Intrinsics::Known([other; 2]));

@@ -31,7 +31,7 @@ fn known() -> Intrinsics {
 #[test]
 fn a_plane_is_distinguished_from_a_rotation_if_the_focal_length_is_known() {
     for seed in [1, 2] {
-        let pair = homography_pair(seed, &camera(), 0.3, &RenderOptions::default()).unwrap();
+        let pair = homography_pair(seed, &camera(), 0.3, &RenderOptions::draft()).unwrap();
         let (a, b) = (&pair.a.image, &pair.b.image);
         for intrinsics in [known(), Intrinsics::Focal([FOCAL; 2])] {
             match refusal(a, b, intrinsics) {
@@ -58,7 +58,7 @@ fn a_rotation_is_identified_or_ambiguous() {
         let scene = Scene::room(seed);
         let first = scene.viewpoint();
         let [a, b] = [first, turn.compose(&first)]
-            .map(|pose| render(&scene, &camera(), &pose, &RenderOptions::default()).unwrap().image);
+            .map(|pose| render(&scene, &camera(), &pose, &RenderOptions::draft()).unwrap().image);
         for intrinsics in [known(), Intrinsics::Focal([FOCAL; 2])] {
             match refusal(&a, &b, intrinsics) {
                 error @ TwoViewError::PureRotation { fraction, degrees } => {
@@ -82,7 +82,7 @@ fn a_rotation_is_identified_or_ambiguous() {
 fn a_short_baseline_is_an_error() {
     // Two centimeters in front of a room of three to six meters: a parallax of two pixels and less.
     for seed in [3, 4] {
-        let views = two_view(seed, &camera(), 0.02, &RenderOptions::default()).unwrap();
+        let views = two_view(seed, &camera(), 0.02, &RenderOptions::draft()).unwrap();
         match refusal(&views.a.image, &views.b.image, known()) {
             error @ TwoViewError::PureRotation { fraction, .. } => {
                 assert!(fraction > 0.95 && error.to_string().contains("hardly moved"), "{error}");
@@ -126,7 +126,7 @@ fn an_implausible_focal_length_is_an_error_with_a_better_one() {
 fn too_few_matches_are_counted() {
     let views = [3, 4].map(|seed| {
         let scene = Scene::room(seed);
-        render(&scene, &camera(), &scene.viewpoint(), &RenderOptions::default()).unwrap().image
+        render(&scene, &camera(), &scene.viewpoint(), &RenderOptions::draft()).unwrap().image
     });
     // Two unrelated rooms.
     for intrinsics in [known(), Intrinsics::Unknown] {

@@ -31,9 +31,9 @@ fn object_columns(frame: usize) -> std::ops::Range<usize> {
 fn frames(seed: u64) -> Vec<Frame> {
     let scene = Scene::room(seed);
     let camera = Camera::from_focal(SIZE.0, SIZE.1, 260.0);
-    let bright = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.2, &RenderOptions::default()).unwrap();
+    let bright = stereo_pair(&scene, &camera, &scene.viewpoint(), 0.2, &RenderOptions::draft()).unwrap();
     let frame = |t: usize| {
-        let noise = RenderOptions { full_well: 3000.0, seed: 500 + t as u64, ..Default::default() };
+        let noise = RenderOptions { full_well: 3000.0, seed: 500 + t as u64, ..RenderOptions::draft() };
         let pair = bright.retake(-1.0, &noise);
         let (mut left, mut right, mut truth) = (pair.left.image, pair.right.image, pair.disparity.clone());
         let mut visible = pair.visible.as_slice().to_vec();

@@ -14,9 +14,7 @@ fn walk(scene: &Scene, camera: &Camera) -> Vec<Rendered> {
         let turn = Rotation3::new(Vector3::new(0.0, 0.03 * i, 0.0));
         Pose::new(turn, Vector3::new(-0.15 * i, 0.0, 0.0)).compose(&first)
     };
-    (0..3)
-        .map(|i| render(scene, camera, &step(i), &RenderOptions::default().with_seed(u64::from(i))).unwrap())
-        .collect()
+    (0..3).map(|i| render(scene, camera, &step(i), &RenderOptions::draft().with_seed(u64::from(i))).unwrap()).collect()
 }
 
 #[test]
@@ -61,7 +59,7 @@ fn tracks_over_three_photographs_join_two_results_by_index() {
 fn matches_of_a_panorama_are_in_pixels_of_its_photographs() {
     let camera = Camera::from_focal(640, 480, 520.0);
     let options = cv_synth::PanoramaSetOptions { views: 3, ..cv_synth::PanoramaSetOptions::default() };
-    let set = panorama_views(1, &camera, &options, &RenderOptions::default()).unwrap();
+    let set = panorama_views(1, &camera, &options, &RenderOptions::draft()).unwrap();
     let photos: Vec<_> = set.views.iter().map(|v| PanoramaPhoto::new(v.image.view())).collect();
     // Features are extracted at half the resolution.
     let small = PanoramaOptions { registration_pixels: 320 * 240, ..PanoramaOptions::default() };

@@ -12,7 +12,7 @@ fn depth_errors_agree_with_the_covariances_and_few_matches_are_wrong() {
     let (mut within, mut count) = (0.0, 0.0);
     let (mut wrong, mut all, mut kept_wrong, mut kept) = (0.0, 0.0, 0.0, 0.0);
     for seed in 0..4 {
-        let views = two_view(seed, &camera, 0.4, &RenderOptions::default()).unwrap();
+        let views = two_view(seed, &camera, 0.4, &RenderOptions::draft()).unwrap();
         let scale = views.relative.translation.norm();
         for guided in [false, true] {
             let options = ReconstructOptions { guided, ..ReconstructOptions::new(Intrinsics::Known([camera; 2])) };

@@ -147,7 +147,7 @@ pub(crate) fn jobs(pixels: usize) -> Vec<Job> {
     ));
     // A room as a photograph shows it, larger.
     let small = Camera::from_focal(480, 360, 400.0);
-    let views = two_view(3, &small, 0.3, &RenderOptions::default()).unwrap();
+    let views = two_view(3, &small, 0.3, &RenderOptions::draft()).unwrap();
     let large =
         |image: &RgbU8| cv_imgproc::resize(image.view(), width, height, cv_imgproc::Interpolation::Bilinear).unwrap();
     let photos = [large(&views.a.image), large(&views.b.image)];
