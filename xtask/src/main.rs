@@ -3,10 +3,13 @@
 mod checks;
 mod fixtures;
 mod golden;
+#[cfg(any(feature = "peers", test))]
 mod peers;
+mod process;
 mod python;
 mod real;
 mod rendered;
+mod sfm_score;
 mod tidy;
 mod trust;
 
@@ -14,7 +17,7 @@ use anyhow::Context;
 use clap::{Parser, Subcommand};
 use std::{
     path::{Path, PathBuf},
-    process::{Command, ExitCode},
+    process::ExitCode,
 };
 
 #[derive(Parser)]
@@ -64,6 +67,7 @@ enum Chore {
         release: bool,
     },
     /// Benchmark other systems and ours on the same inputs.
+    #[cfg(any(feature = "peers", test))]
     Peers {
         /// Only this job; `all` or none: every one.
         job: Option<String>,
@@ -79,6 +83,7 @@ fn main() -> ExitCode {
         Chore::Rendered { job } => rendered::run(job.as_deref()),
         Chore::Trust { job, count, seed } => trust::run(job.as_deref(), &trust::Options { count, seed }),
         Chore::Python { release } => python::run(release),
+        #[cfg(any(feature = "peers", test))]
         Chore::Peers { job } => peers::run(job.as_deref()),
     };
     match result {
@@ -109,15 +114,4 @@ fn data_dir() -> Option<PathBuf> {
 fn target_dir() -> anyhow::Result<PathBuf> {
     let program = std::env::current_exe()?;
     Ok(program.ancestors().nth(2).context("the program is not in a target folder")?.to_owned())
-}
-
-/// Builds our program with the release profile, unless it is up to date, and returns its path.
-fn release_program() -> anyhow::Result<PathBuf> {
-    let target = target_dir()?;
-    peers::check(
-        Command::new("cargo")
-            .args(["build", "--release", "--quiet", "--locked", "--package", "cv-cli", "--bin", "cv", "--target-dir"])
-            .arg(&target),
-    )?;
-    Ok(target.join("release").join(format!("cv{}", std::env::consts::EXE_SUFFIX)))
 }

@@ -1,6 +1,7 @@
 //! Builds the wheel of the Python package, installs it into a new virtual environment and runs its tests there.
 
-use crate::{peers, root, target_dir};
+use crate::process::check;
+use crate::{root, target_dir};
 use anyhow::{Context, Result, ensure};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -21,7 +22,7 @@ pub(crate) fn run(release: bool) -> Result<bool> {
     }
     let folder = target.join("python");
     let environment = folder.join("venv");
-    peers::check(Command::new(&python).args(["-m", "venv", "--clear"]).arg(&environment))?;
+    check(Command::new(&python).args(["-m", "venv", "--clear"]).arg(&environment))?;
     let programs = environment.join(if cfg!(windows) { "Scripts" } else { "bin" });
     let interpreter = programs.join(format!("python{}", std::env::consts::EXE_SUFFIX));
     let pip = |arguments: &[&str]| {
@@ -33,7 +34,7 @@ pub(crate) fn run(release: bool) -> Result<bool> {
         command
     };
     let sources = root().join("python");
-    peers::check(pip(&["-r"]).arg(sources.join("requirements.txt")))?;
+    check(pip(&["-r"]).arg(sources.join("requirements.txt")))?;
     // Installed in parallel with the build of the wheel.
     let mut peers_install = pip(&["-r"]).arg(sources.join("requirements-peers.txt")).spawn().context("pip")?;
     let wheels = folder.join("wheels");
@@ -46,14 +47,14 @@ pub(crate) fn run(release: bool) -> Result<bool> {
     let old_linux = release && cfg!(target_os = "linux");
     maturin.args(if release { &["--release"][..] } else { &["--profile", "dev"] });
     if old_linux {
-        peers::check(pip(&["-r"]).arg(sources.join("requirements-release.txt")))?;
+        check(pip(&["-r"]).arg(sources.join("requirements-release.txt")))?;
         maturin.args(["--zig", "--compatibility", MIN_LINUX_TAG]).env("CARGO_ZIGBUILD_PYTHON_PATH", &interpreter);
     }
     if is_free_threaded(&interpreter)? {
         // Free-threaded Python has no stable ABI before 3.15.
         maturin.arg("--no-default-features");
     }
-    peers::check(&mut maturin)?;
+    check(&mut maturin)?;
     let wheel_files: Vec<PathBuf> = std::fs::read_dir(&wheels)?.map(|e| Ok(e?.path())).collect::<Result<_>>()?;
     let [wheel] = &wheel_files[..] else { anyhow::bail!("{} wheels in {}", wheel_files.len(), wheels.display()) };
     println!("python: {} has {} bytes", wheel.display(), std::fs::metadata(wheel)?.len());
@@ -62,7 +63,7 @@ pub(crate) fn run(release: bool) -> Result<bool> {
     if !peers_install.wait().context("pip")?.success() {
         println!("python: some peers could not be installed");
     }
-    peers::check(pip(&["--no-deps"]).arg(wheel))?;
+    check(pip(&["--no-deps"]).arg(wheel))?;
     let program = built_program(release, &target)?;
     let tests = |mark: &str| {
         let mut command = Command::new(&interpreter);
@@ -87,7 +88,7 @@ fn built_program(release: bool, target: &Path) -> Result<PathBuf> {
     if release {
         build.arg("--release");
     }
-    peers::check(build.env("CARGO_TARGET_DIR", target).current_dir(root()))?;
+    check(build.env("CARGO_TARGET_DIR", target).current_dir(root()))?;
     let profile = if release { "release" } else { "debug" };
     Ok(target.join(profile).join(format!("cv{}", std::env::consts::EXE_SUFFIX)))
 }

@@ -313,7 +313,7 @@ fn run_stage(command: &mut Command) -> Result<Timing> {
 /// Builds the program of the Rust libraries for this machine's processor, since not all of them select instructions at run time as ours does.
 fn build_rust_peers() -> Result<PathBuf> {
     let target = crate::root().join("target/peers-rust");
-    super::check(
+    crate::process::check(
         Command::new("cargo")
             .args(["build", "--release", "--quiet", "--locked", "--manifest-path"])
             .arg(crate::root().join("peers/rust/Cargo.toml"))

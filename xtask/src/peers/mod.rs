@@ -16,12 +16,12 @@ mod panorama_border;
 mod panorama_people;
 mod panorama_truth;
 mod sfm;
-pub(crate) mod sfm_score;
 mod stereo;
 mod stereo_groups;
 
 use crate::checks::{self, Check};
-use anyhow::{Context, Result, ensure};
+use crate::process::check;
+use anyhow::{Context, Result};
 use std::{
     path::{Path, PathBuf},
     process::Command,
@@ -73,15 +73,15 @@ fn python() -> Result<PathBuf> {
     Ok(python)
 }
 
-/// Runs a program to its end.
-///
-/// # Errors
-///
-/// If it cannot be started or its exit status is not zero.
-pub(crate) fn check(command: &mut Command) -> Result<()> {
-    let status = command.status().with_context(|| format!("cannot start {command:?}"))?;
-    ensure!(status.success(), "{command:?} failed: {status}");
-    Ok(())
+/// Builds our program with the release profile, unless it is up to date, and returns its path.
+fn release_program() -> Result<PathBuf> {
+    let target = crate::target_dir()?;
+    check(
+        Command::new("cargo")
+            .args(["build", "--release", "--quiet", "--locked", "--package", "cv-cli", "--bin", "cv", "--target-dir"])
+            .arg(&target),
+    )?;
+    Ok(target.join("release").join(format!("cv{}", std::env::consts::EXE_SUFFIX)))
 }
 
 /// Replaces the section under `## name` of `docs/benchmarks.md`, or adds it at the end.

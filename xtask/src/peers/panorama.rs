@@ -59,7 +59,7 @@ struct Compared {
 }
 
 pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
-    let program = crate::release_program()?;
+    let program = super::release_program()?;
     let cache = crate::target_dir()?.join("peers-panorama");
     let load = super::machine_load();
     let mut sets = Vec::new();

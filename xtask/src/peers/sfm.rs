@@ -4,8 +4,8 @@
 //! The peers take ten minutes, so their models and figures are cached in `peers-sfm` of the target folder, by set, until their scripts
 //! or versions change. Remove a set's folder to run them again.
 
-use super::sfm_score::{Poses, Score, read_truth, score};
 use crate::checks::Check;
+use crate::sfm_score::{Poses, Score, read_truth, score};
 use anyhow::{Context, Result, ensure};
 use cv_core::SparseModel;
 use serde::Deserialize;
@@ -161,7 +161,7 @@ struct Compared {
 }
 
 pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
-    let program = crate::release_program()?;
+    let program = super::release_program()?;
     let cache = crate::target_dir()?.join("peers-sfm");
     let mut versions = Vec::new();
     let mut sets = Vec::new();

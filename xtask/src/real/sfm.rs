@@ -1,7 +1,7 @@
 //! Structure from motion on a surveyed facade and around an object on a robot arm, with known intrinsics.
 
 use super::Check;
-use crate::peers::sfm_score::{read_truth, score};
+use crate::sfm_score::{read_truth, score};
 use anyhow::{Context, Result, ensure};
 use cv_pipeline::many_views::CameraKnowledge;
 use cv_pipeline::{SfmCamera, SfmJobOptions, Silent, sfm, sfm_photo};
