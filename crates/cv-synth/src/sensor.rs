@@ -48,8 +48,8 @@ impl RenderOptions {
         Self { vignetting: 0.0, full_well: f32::INFINITY, read_noise: 0.0, blur: 0.0, ..Self::default() }
     }
 
-    /// Returns the options with one sample for each pixel, in a third of the time, for results that do not depend on how
-    /// fine texture is averaged over a pixel.
+    /// Returns the options with one sample for each pixel instead of four, for results that do not depend on how fine
+    /// texture is averaged over a pixel.
     pub fn draft() -> Self {
         Self { samples: 1, ..Self::default() }
     }

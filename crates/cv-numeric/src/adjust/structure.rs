@@ -519,45 +519,19 @@ fn build_pattern(
 
 #[cfg(test)]
 mod tests {
-    use super::super::residual::{ColumnSums, LossModel, PointSums, ResidualSums, Values, WeightedRows};
     use super::*;
-    use crate::adjust::{Adjustment, Euclidean};
+    use crate::adjust::{Adjustment, Euclidean, Residual, RobustLoss};
+    use nalgebra::{SMatrix, Vector2};
 
-    /// Residuals of two blocks of one group, of which only the structure matters.
-    struct Pairs(Vec<[u32; 2]>);
+    /// Residuals of two positions in a plane, of which only the structure matters.
+    struct Pairs;
 
-    impl ResidualKind for Pairs {
-        fn name(&self) -> &str {
-            "pairs"
+    impl Residual<2, 2, 4> for Pairs {
+        const DIMS: [usize; 2] = [2, 2];
+
+        fn evaluate(&self, _: usize, _: [&[f64]; 2], _: Option<&mut SMatrix<f64, 2, 4>>) -> Option<Vector2<f64>> {
+            None
         }
-
-        fn len(&self) -> usize {
-            self.0.len()
-        }
-
-        fn groups(&self) -> &[usize] {
-            &[0, 0]
-        }
-
-        fn blocks(&self, item: usize) -> &[u32] {
-            &self.0[item]
-        }
-
-        fn cost(&self, _: &Values) -> f64 {
-            f64::INFINITY
-        }
-
-        fn linearize(&self, _: &Values, _: &Incidence, _: LossModel, _: &mut WeightedRows) -> Result<(), usize> {
-            Err(0)
-        }
-
-        fn sums(&self, _: &Values) -> Result<ResidualSums, usize> {
-            Err(0)
-        }
-
-        fn add_to_point(&self, _: &WeightedRows, _: &Incidence, _: Range<usize>, _: PointSums<'_>) {}
-
-        fn add_to_columns(&self, _: &WeightedRows, _: &Incidence, _: &[u32], _: ColumnSums<'_>) {}
     }
 
     #[test]
@@ -568,7 +542,7 @@ mod tests {
         let positions = problem.add_group("positions", Euclidean(2), vec![0.0; 2 * n as usize]).unwrap();
         let mut blocks: Vec<[u32; 2]> = (0..n).map(|i| [i, (i + 1) % n]).collect();
         blocks.extend((0..n).step_by(9).map(|i| [i, (i + 20) % n]));
-        problem.kinds.push(Box::new(Pairs(blocks)));
+        problem.add_residuals("pairs", Pairs, [positions; 2], blocks, RobustLoss::Trivial).unwrap();
         problem.fix(positions, 0).unwrap();
         assert!(!Structure::new(&problem.groups, &problem.kinds, None, false).pattern.dense);
     }

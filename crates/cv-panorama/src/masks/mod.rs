@@ -110,7 +110,7 @@ const REMOVED: u8 = 1;
 const KEPT: u8 = 2;
 
 #[cfg(test)]
-mod mask_tests {
+mod tests {
     use super::*;
     use proptest::prelude::*;
 
