@@ -21,15 +21,15 @@ pub(crate) trait Epipolar<const N: usize>: Clone {
 }
 
 /// Minimizes the robust Sampson error `Σ ρ(sampson² / threshold²)` over a parameterization.
-pub(crate) struct SampsonProblem<'a, C: Scorer, M, const N: usize> {
+pub(crate) struct SampsonProblem<'a, M, const N: usize> {
     pub(crate) pairs: &'a [[f64; 4]],
-    pub(crate) scorer: &'a C,
+    pub(crate) scorer: &'a dyn Scorer,
     pub(crate) threshold: f64,
     parameterization: PhantomData<M>,
 }
 
-impl<'a, C: Scorer, M: Epipolar<N>, const N: usize> SampsonProblem<'a, C, M, N> {
-    pub(crate) fn new(pairs: &'a [[f64; 4]], scorer: &'a C, threshold: f64) -> Self {
+impl<'a, M: Epipolar<N>, const N: usize> SampsonProblem<'a, M, N> {
+    pub(crate) fn new(pairs: &'a [[f64; 4]], scorer: &'a dyn Scorer, threshold: f64) -> Self {
         Self { pairs, scorer, threshold, parameterization: PhantomData }
     }
 
@@ -50,10 +50,11 @@ impl<'a, C: Scorer, M: Epipolar<N>, const N: usize> SampsonProblem<'a, C, M, N> 
     /// Computes the cost.
     #[inline(always)]
     fn sum(&self, f: &Matrix3<f64>) -> f64 {
+        let cutoff = self.scorer.cutoff();
         let mut cost = 0.0;
         for pair in self.pairs {
             let u = self.terms(f, pair).4;
-            cost += if u < self.scorer.cutoff() { f64::from(self.scorer.loss(u as f32)) } else { 1.0 };
+            cost += if u < cutoff { f64::from(self.scorer.loss(u as f32)) } else { 1.0 };
         }
         cost
     }
@@ -63,10 +64,11 @@ impl<'a, C: Scorer, M: Epipolar<N>, const N: usize> SampsonProblem<'a, C, M, N> 
     fn sums(&self, f: &Matrix3<f64>) -> Sums {
         let (mut hessian, mut last, mut gradient) = ([[0.0; 8]; 8], [0.0; 8], [0.0; 8]);
         let (mut cost, mut sum, mut weighted) = (0.0, 0.0, 0.0);
+        let cutoff = self.scorer.cutoff();
         for pair in self.pairs {
             let (l, m, c, inverse, u) = self.terms(f, pair);
             // False for NaN.
-            let is_below_cutoff = u < self.scorer.cutoff();
+            let is_below_cutoff = u < cutoff;
             if !is_below_cutoff {
                 cost += 1.0;
                 continue;
@@ -108,7 +110,7 @@ struct Sums {
     weighted: f64,
 }
 
-impl<C: Scorer, M: Epipolar<N>, const N: usize> LeastSquares for SampsonProblem<'_, C, M, N> {
+impl<M: Epipolar<N>, const N: usize> LeastSquares for SampsonProblem<'_, M, N> {
     type Dim = Const<N>;
     type Params = M;
 
@@ -151,8 +153,8 @@ impl<C: Scorer, M: Epipolar<N>, const N: usize> LeastSquares for SampsonProblem<
 }
 
 /// Refines `start` by at most `iterations` Levenberg–Marquardt steps; `None` if none reduced the cost.
-pub(crate) fn refine_sampson<C: Scorer, M: Epipolar<N>, const N: usize>(
-    problem: &SampsonProblem<'_, C, M, N>,
+pub(crate) fn refine_sampson<M: Epipolar<N>, const N: usize>(
+    problem: &SampsonProblem<'_, M, N>,
     start: M,
     iterations: usize,
 ) -> Option<M> {

@@ -186,10 +186,10 @@ impl Estimator for FocalEstimator {
         kernel.squared_residuals(block)
     }
 
-    fn refine<C: Scorer>(
+    fn refine(
         &self,
         model: &SharedFocalPose,
-        scorer: &C,
+        scorer: &dyn Scorer,
         threshold: f64,
         iterations: usize,
     ) -> Option<SharedFocalPose> {

@@ -106,13 +106,13 @@ fn world_degeneracy(matches: &[WorldMatch]) -> Option<Degeneracy> {
 }
 
 /// Minimizes the robust reprojection error `Σ ρ(error² / threshold²)` over poses.
-struct ReprojectionProblem<'a, C: Scorer> {
+struct ReprojectionProblem<'a> {
     matches: &'a [WorldMatch],
-    scorer: &'a C,
+    scorer: &'a dyn Scorer,
     threshold: f64,
 }
 
-impl<C: Scorer> LeastSquares for ReprojectionProblem<'_, C> {
+impl LeastSquares for ReprojectionProblem<'_> {
     type Dim = Const<6>;
     type Params = Pose;
 
@@ -159,7 +159,7 @@ impl<C: Scorer> LeastSquares for ReprojectionProblem<'_, C> {
     }
 }
 
-fn refine<C: Scorer>(problem: &ReprojectionProblem<'_, C>, start: &Pose, iterations: usize) -> Option<Pose> {
+fn refine(problem: &ReprojectionProblem<'_>, start: &Pose, iterations: usize) -> Option<Pose> {
     let options = LmOptions { max_iterations: iterations, cost_tolerance: 1e-6, ..LmOptions::default() };
     let report = levenberg_marquardt(problem, *start, &options);
     let rotation = orthonormalized(&report.params.rotation)?;
@@ -274,7 +274,7 @@ impl Estimator for AbsoluteEstimator {
         out
     }
 
-    fn refine<C: Scorer>(&self, model: &Pose, scorer: &C, threshold: f64, iterations: usize) -> Option<Pose> {
+    fn refine(&self, model: &Pose, scorer: &dyn Scorer, threshold: f64, iterations: usize) -> Option<Pose> {
         refine(&ReprojectionProblem { matches: &self.matches, scorer, threshold }, model, iterations)
     }
 }

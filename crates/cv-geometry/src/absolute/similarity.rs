@@ -143,13 +143,7 @@ impl Estimator for SimilarityEstimator {
         })
     }
 
-    fn refine<C: Scorer>(
-        &self,
-        model: &Similarity,
-        scorer: &C,
-        threshold: f64,
-        iterations: usize,
-    ) -> Option<Similarity> {
+    fn refine(&self, model: &Similarity, scorer: &dyn Scorer, threshold: f64, iterations: usize) -> Option<Similarity> {
         let cost = |model: &Similarity| {
             self.relative_squared_residuals(model, threshold).map(|u| f64::from(scorer.loss(u as f32))).sum::<f64>()
         };

@@ -260,7 +260,7 @@ impl Estimator for PoseEstimator {
         kernel.squared_residuals(block)
     }
 
-    fn refine<C: Scorer>(&self, model: &Pose, scorer: &C, threshold: f64, iterations: usize) -> Option<Pose> {
+    fn refine(&self, model: &Pose, scorer: &dyn Scorer, threshold: f64, iterations: usize) -> Option<Pose> {
         let problem = SampsonProblem::new(&self.set.pairs, scorer, threshold);
         refine_sampson(&problem, *model, iterations).and_then(with_orthonormal_rotation)
     }

@@ -123,10 +123,10 @@ impl Estimator for FundamentalEstimator {
         kernel.squared_residuals(block)
     }
 
-    fn refine<C: Scorer>(
+    fn refine(
         &self,
         model: &Matrix3<f64>,
-        scorer: &C,
+        scorer: &dyn Scorer,
         threshold: f64,
         iterations: usize,
     ) -> Option<Matrix3<f64>> {

@@ -173,10 +173,10 @@ impl Estimator for HomographyEstimator {
         kernel.squared_residuals(block)
     }
 
-    fn refine<C: Scorer>(
+    fn refine(
         &self,
         model: &Matrix3<f64>,
-        scorer: &C,
+        scorer: &dyn Scorer,
         threshold: f64,
         iterations: usize,
     ) -> Option<Matrix3<f64>> {
@@ -196,7 +196,7 @@ mod tests {
     use rand_chacha::rand_core::SeedableRng;
 
     /// The cost in f64: the problem's own cost has f32 losses and is not precise enough.
-    fn plain_cost(problem: &TransferProblem<'_, LeastSquaresLoss>, h: &Matrix3<f64>) -> f64 {
+    fn plain_cost(problem: &TransferProblem<'_>, h: &Matrix3<f64>) -> f64 {
         let residual = |p: &[f64; 4]| homography_residual(h, &Correspondence::new(p[0], p[1], p[2], p[3]));
         problem.pairs.iter().map(|p| residual(p).powi(2)).sum()
     }

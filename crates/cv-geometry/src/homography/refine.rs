@@ -8,9 +8,9 @@ use nalgebra::{Const, SMatrix, SVector};
 
 /// Minimizes the robust symmetric transfer error `Σ ρ((d₁² + d₂²)/2 / threshold²)` over the eight entries other than
 /// `H[2][2] = 1`. `d₂` is the distance from `b` to `H a`, `d₁` that from `a` to `H⁻¹ b`.
-pub(crate) struct TransferProblem<'a, C: Scorer> {
+pub(crate) struct TransferProblem<'a> {
     pub(crate) pairs: &'a [[f64; 4]],
-    pub(crate) scorer: &'a C,
+    pub(crate) scorer: &'a dyn Scorer,
     pub(crate) threshold: f64,
 }
 
@@ -63,7 +63,7 @@ impl TransferSums {
     }
 }
 
-impl<C: Scorer> TransferProblem<'_, C> {
+impl TransferProblem<'_> {
     /// Computes `H a`, `1/w`, `H⁻¹ b`, `1/w'`, and `u`, which is NaN if a point maps behind the camera.
     #[inline(always)]
     fn terms(&self, h: &Matrix3<f64>, g: &Matrix3<f64>, &[x, y, s, t]: &[f64; 4]) -> ([f64; 3], [f64; 3], f64) {
@@ -81,10 +81,11 @@ impl<C: Scorer> TransferProblem<'_, C> {
     /// Computes the cost.
     #[inline(always)]
     fn sum(&self, h: &Matrix3<f64>, g: &Matrix3<f64>) -> f64 {
+        let cutoff = self.scorer.cutoff();
         let mut cost = 0.0;
         for pair in self.pairs {
             let u = self.terms(h, g, pair).2;
-            cost += if u < self.scorer.cutoff() { f64::from(self.scorer.loss(u as f32)) } else { 1.0 };
+            cost += if u < cutoff { f64::from(self.scorer.loss(u as f32)) } else { 1.0 };
         }
         cost
     }
@@ -93,11 +94,12 @@ impl<C: Scorer> TransferProblem<'_, C> {
     #[inline(always)]
     fn sums(&self, h: &Matrix3<f64>, g: &Matrix3<f64>) -> (f64, TransferSums, TransferSums) {
         let (mut forward, mut backward) = (TransferSums::ZERO, TransferSums::ZERO);
+        let cutoff = self.scorer.cutoff();
         let mut cost = 0.0;
         for pair in self.pairs {
             let (a, b, u) = self.terms(h, g, pair);
             // False for NaN.
-            if u < self.scorer.cutoff() {
+            if u < cutoff {
                 let [x, y, s, t] = *pair;
                 cost += f64::from(self.scorer.loss(u as f32));
                 let weight = self.scorer.weight(u);
@@ -116,7 +118,7 @@ pub(crate) fn inverse(h: &Matrix3<f64>) -> Option<Matrix3<f64>> {
     h.try_inverse()
 }
 
-impl<C: Scorer> LeastSquares for TransferProblem<'_, C> {
+impl LeastSquares for TransferProblem<'_> {
     type Dim = Const<8>;
     type Params = Matrix3<f64>;
 
@@ -158,8 +160,8 @@ impl<C: Scorer> LeastSquares for TransferProblem<'_, C> {
 }
 
 /// Refines `h` (of any scale) by at most `iterations` Levenberg–Marquardt steps; `None` if none reduced the cost.
-pub(crate) fn refine_transfer<C: Scorer>(
-    problem: &TransferProblem<'_, C>,
+pub(crate) fn refine_transfer(
+    problem: &TransferProblem<'_>,
     h: &Matrix3<f64>,
     iterations: usize,
 ) -> Option<Matrix3<f64>> {

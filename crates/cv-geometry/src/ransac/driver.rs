@@ -2,7 +2,7 @@
 
 use super::quality::Quality;
 use super::{
-    Consensus, Estimator, LocalOptimization, RansacData, RobustOptions, Sampler, Score, Scorer, TukeyBiweight,
+    Consensus, Estimator, LocalOptimization, RansacData, RobustOptions, Sampler, Score, Scorer, Scoring, TukeyBiweight,
 };
 use cv_core::{Cancelled, Progress, Stage};
 use cv_parallel::prelude::*;
@@ -47,8 +47,8 @@ struct Candidate<M> {
 ///
 /// Batches grow with the number of samples drawn. The bounds used in a batch are those from before it, so the result
 /// does not depend on its distribution over threads.
-pub(super) fn search<E: Estimator, C: Scorer>(
-    quality: &Quality<'_, E, C>,
+pub(super) fn search<E: Estimator>(
+    quality: &Quality<'_, E>,
     sampler: &mut dyn Sampler,
     options: &RobustOptions,
     progress: &dyn Progress,
@@ -145,8 +145,8 @@ impl Progress for Samples<'_> {
 }
 
 /// Returns the locally optimized minimal model, or its best locally optimized alternative if that is better.
-fn optimize_locally<E: Estimator, C: Scorer>(
-    quality: &Quality<'_, E, C>,
+fn optimize_locally<E: Estimator>(
+    quality: &Quality<'_, E>,
     candidate: Candidate<E::Model>,
     models: &mut Vec<E::Model>,
     progress: &dyn Progress,
@@ -175,8 +175,8 @@ fn optimize_locally<E: Estimator, C: Scorer>(
 /// Refines the model (with inner RANSAC if `rng` is given) with a loss scaled to the estimated noise instead of the
 /// threshold: a threshold too large for the noise admits outliers and other minima, one too small loses inliers. Two
 /// rounds: a third changes the model by less than a tenth of its standard deviation.
-fn refine_with_estimated_noise<E: Estimator, C: Scorer>(
-    quality: &Quality<'_, E, C>,
+fn refine_with_estimated_noise<E: Estimator>(
+    quality: &Quality<'_, E>,
     mut best: ScoredModel<E::Model>,
     mut rng: Option<&mut ChaCha8Rng>,
     models: &mut Vec<E::Model>,
@@ -192,7 +192,7 @@ fn refine_with_estimated_noise<E: Estimator, C: Scorer>(
             break;
         };
         let threshold = BIWEIGHT_SCALE * sigma * quality.threshold / TukeyBiweight.cutoff().sqrt();
-        let rescaled = Quality::new(quality.estimator, &TukeyBiweight, threshold);
+        let rescaled = Quality::new(quality.estimator, Scoring::TukeyBiweight, threshold);
         best.score = rescaled.score(&best.model, f32::INFINITY);
         rescaled.refine_best(&mut best, steps);
         if let Some(rng) = &mut rng {
@@ -204,8 +204,8 @@ fn refine_with_estimated_noise<E: Estimator, C: Scorer>(
 }
 
 /// Returns the model of minimum loss below `limit` of all samples; the earliest on ties.
-fn best_of_samples<E: Estimator, C: Scorer>(
-    quality: &Quality<'_, E, C>,
+fn best_of_samples<E: Estimator>(
+    quality: &Quality<'_, E>,
     samples: &[[u32; 8]],
     mut limit: f32,
     models: &mut Vec<E::Model>,

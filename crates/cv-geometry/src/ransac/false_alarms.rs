@@ -1,7 +1,7 @@
 //! A-contrario validation: the number of false alarms (NFA) of a model.
 
 use super::quality::Quality;
-use super::{Estimator, MAX_LOG_NFA, RansacData, Scorer};
+use super::{Estimator, MAX_LOG_NFA, RansacData};
 use crate::match_blocks::LANES;
 
 /// Numbers of background data: enough for clear decisions, and enough to estimate the probability for a homography with
@@ -26,10 +26,7 @@ pub(super) struct FalseAlarms {
 /// under the background model, in which each datum is an inlier with probability `p`.
 ///
 /// `None` if the estimator has no background data, or there are no more data than the minimal sample.
-pub(super) fn false_alarms<E: Estimator, C: Scorer>(
-    quality: &Quality<'_, E, C>,
-    model: &E::Model,
-) -> Option<FalseAlarms> {
+pub(super) fn false_alarms<E: Estimator>(quality: &Quality<'_, E>, model: &E::Model) -> Option<FalseAlarms> {
     let n = quality.estimator.data().count();
     if n <= E::SAMPLE_SIZE {
         return None;

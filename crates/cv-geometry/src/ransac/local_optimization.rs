@@ -3,7 +3,7 @@
 use super::driver::{LOCAL_STEPS, ScoredModel};
 use super::quality::Quality;
 use super::sampler::draw_distinct;
-use super::{Estimator, RansacData, Scorer};
+use super::{Estimator, RansacData};
 use cv_core::{Cancelled, Progress};
 use rand_chacha::ChaCha8Rng;
 
@@ -12,10 +12,10 @@ const MAX_INNER_ITERATIONS: usize = 200;
 /// Maximum ratio of losses that counts as another, better minimum, rather than progress in the same one.
 const MIN_IMPROVEMENT: f32 = 0.9999;
 
-impl<E: Estimator, C: Scorer> Quality<'_, E, C> {
+impl<E: Estimator> Quality<'_, E> {
     /// Refines a model; keeps the result if its loss is lower.
     pub(super) fn refine_best(&self, best: &mut ScoredModel<E::Model>, iterations: usize) {
-        if let Some(model) = self.estimator.refine(&best.model, self.scorer, self.threshold, iterations) {
+        if let Some(model) = self.estimator.refine(&best.model, self.scoring.scorer(), self.threshold, iterations) {
             let score = self.score(&model, best.score.loss);
             if score.loss < best.score.loss {
                 *best = ScoredModel { model, score };

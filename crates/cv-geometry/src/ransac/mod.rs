@@ -90,10 +90,10 @@ pub trait Estimator: Sync {
     /// Minimizes the sum of `scorer`'s loss, starting at `model`, in at most `iterations` steps.
     ///
     /// `threshold` is in estimator units. `None` if no step reduced the loss.
-    fn refine<C: Scorer>(
+    fn refine(
         &self,
         model: &Self::Model,
-        scorer: &C,
+        scorer: &dyn Scorer,
         threshold: f64,
         iterations: usize,
     ) -> Option<Self::Model>;
@@ -151,24 +151,11 @@ pub fn ransac<E: Estimator>(
     progress: &dyn Progress,
 ) -> Result<Consensus<E::Model>, EstimateError> {
     options.check()?;
-    match options.scoring {
-        Scoring::Msac => ransac_with_scorer(estimator, options, &Msac, progress),
-        Scoring::TukeyBiweight => ransac_with_scorer(estimator, options, &TukeyBiweight, progress),
-        Scoring::Other(scorer) => ransac_with_scorer(estimator, options, &scorer, progress),
-    }
-}
-
-fn ransac_with_scorer<E: Estimator, C: Scorer>(
-    estimator: &E,
-    options: &RobustOptions,
-    scorer: &C,
-    progress: &dyn Progress,
-) -> Result<Consensus<E::Model>, EstimateError> {
     let n = estimator.data().count();
     if n < E::SAMPLE_SIZE {
         return Err(EstimateError::NotEnoughMatches { got: n, needed: E::SAMPLE_SIZE });
     }
-    let quality = Quality::new(estimator, scorer, options.threshold * estimator.threshold_scale());
+    let quality = Quality::new(estimator, options.scoring, options.threshold * estimator.threshold_scale());
     let sampler: &mut dyn Sampler = match options.sampling {
         Sampling::Uniform => &mut Uniform::new(n, options.seed),
         Sampling::Prosac => &mut Prosac::new(n, E::SAMPLE_SIZE, options.max_iterations, options.seed),

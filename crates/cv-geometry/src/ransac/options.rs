@@ -1,6 +1,6 @@
 //! Options of the robust estimators.
 
-use super::Scorer;
+use super::{Msac, Scorer, TukeyBiweight};
 use cv_core::OptionError;
 
 /// The robust loss by which models are scored.
@@ -14,9 +14,20 @@ pub enum Scoring {
     /// (Barath et al. 2020).
     #[default]
     TukeyBiweight,
-    /// A custom loss. It is dispatched dynamically: several times slower than the built-in losses.
+    /// A custom loss. It is called for every residual: several times slower than the built-in losses.
     #[cfg_attr(feature = "serde", serde(skip))]
     Other(&'static dyn Scorer),
+}
+
+impl Scoring {
+    /// Returns the loss.
+    pub(super) fn scorer(self) -> &'static dyn Scorer {
+        match self {
+            Self::Msac => &Msac,
+            Self::TukeyBiweight => &TukeyBiweight,
+            Self::Other(scorer) => scorer,
+        }
+    }
 }
 
 /// Custom losses are equal if they are the same object.

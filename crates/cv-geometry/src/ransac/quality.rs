@@ -1,19 +1,19 @@
 //! Scoring of models: loss and inlier count over all data, and the noise of the inliers.
 
-use super::{BlockOf, Estimator, RansacData, Score, Scorer};
+use super::{BlockOf, Estimator, Msac, RansacData, Score, Scorer, Scoring, TukeyBiweight};
 use crate::match_blocks::LANES;
 use fearless_simd::{Level, dispatch};
 
-/// Sums the losses over all blocks; returns [`Score::WORST`] as soon as the sum exceeds `limit`.
+/// Sums the `loss` of `u = (residual / threshold)²` over all blocks; returns [`Score::WORST`] as soon as the sum exceeds `limit`.
 ///
 /// Lanes are accumulated separately in a fixed order and no product is fused, so all instruction sets give identical
 /// results.
 #[inline(always)]
-fn score_blocks<E: Estimator, C: Scorer>(
+fn score_blocks<E: Estimator>(
     kernel: &E::Kernel,
     blocks: &[BlockOf<E>],
     padding: usize,
-    scorer: &C,
+    loss: impl Fn(f32) -> f32,
     inverse_threshold2: f32,
     limit: f32,
 ) -> Score {
@@ -26,7 +26,7 @@ fn score_blocks<E: Estimator, C: Scorer>(
             let r2 = E::squared_residuals(kernel, block);
             for i in 0..LANES {
                 let u = r2[i] * inverse_threshold2;
-                losses[i] += scorer.loss(u);
+                losses[i] += loss(u);
                 inliers[i] += u32::from(u < 1.0);
             }
         }
@@ -65,9 +65,9 @@ fn sum(lanes: &[f32; LANES]) -> f32 {
 }
 
 /// Scores models of an estimator on its data.
-pub(super) struct Quality<'a, E: Estimator, C: Scorer> {
+pub(super) struct Quality<'a, E: Estimator> {
     pub(super) estimator: &'a E,
-    pub(super) scorer: &'a C,
+    pub(super) scoring: Scoring,
     /// In estimator units.
     pub(super) threshold: f64,
     level: Level,
@@ -75,11 +75,11 @@ pub(super) struct Quality<'a, E: Estimator, C: Scorer> {
     padding: usize,
 }
 
-impl<'a, E: Estimator, C: Scorer> Quality<'a, E, C> {
-    pub(super) fn new(estimator: &'a E, scorer: &'a C, threshold: f64) -> Self {
+impl<'a, E: Estimator> Quality<'a, E> {
+    pub(super) fn new(estimator: &'a E, scoring: Scoring, threshold: f64) -> Self {
         Self {
             estimator,
-            scorer,
+            scoring,
             threshold,
             level: Level::new(),
             inverse_threshold2: (1.0 / (threshold * threshold)) as f32,
@@ -91,7 +91,18 @@ impl<'a, E: Estimator, C: Scorer> Quality<'a, E, C> {
     pub(super) fn score(&self, model: &E::Model, limit: f32) -> Score {
         let kernel = self.estimator.kernel(model);
         let (blocks, padding, scale) = (self.estimator.data().blocks(), self.padding, self.inverse_threshold2);
-        dispatch!(self.level, _simd => score_blocks::<E, C>(&kernel, blocks, padding, self.scorer, scale, limit))
+        // The built-in losses are inlined into the loop.
+        match self.scoring {
+            Scoring::Msac => dispatch!(self.level, _simd => {
+                score_blocks::<E>(&kernel, blocks, padding, |u| Msac.loss(u), scale, limit)
+            }),
+            Scoring::TukeyBiweight => dispatch!(self.level, _simd => {
+                score_blocks::<E>(&kernel, blocks, padding, |u| TukeyBiweight.loss(u), scale, limit)
+            }),
+            Scoring::Other(scorer) => dispatch!(self.level, _simd => {
+                score_blocks::<E>(&kernel, blocks, padding, |u| scorer.loss(u), scale, limit)
+            }),
+        }
     }
 
     /// Counts the data of `blocks` within `radius` thresholds, half of that, a quarter of that, and so on.

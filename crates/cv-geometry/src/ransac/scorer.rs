@@ -13,21 +13,6 @@ pub trait Scorer: std::fmt::Debug + Sync {
     fn cutoff(&self) -> f64;
 }
 
-/// A custom loss ([`Scoring::Other`](super::Scoring::Other)).
-impl Scorer for &dyn Scorer {
-    fn loss(&self, u: f32) -> f32 {
-        (**self).loss(u)
-    }
-
-    fn weight(&self, u: f64) -> f64 {
-        (**self).weight(u)
-    }
-
-    fn cutoff(&self) -> f64 {
-        (**self).cutoff()
-    }
-}
-
 /// Least squares, for inliers only.
 #[derive(Debug)]
 pub(crate) struct LeastSquaresLoss;
