@@ -21,10 +21,10 @@ pub trait Named: Clone + Send + Sync + Sized + 'static {
     fn from_name(name: &str) -> Result<Self, UnknownName> {
         let name = Self::ALIASES.iter().find(|(alias, _)| *alias == name).map_or(name, |(_, listed)| listed);
         let found = Self::NAMES.iter().find(|(listed, _)| *listed == name);
-        found.map(|(_, value)| value.clone()).ok_or_else(|| UnknownName {
-            name: name.to_owned(),
-            known: Self::NAMES.iter().map(|(listed, _)| *listed).collect::<Vec<_>>().join(", "),
-        })
+        match found {
+            Some((_, value)) => Ok(value.clone()),
+            None => Err(UnknownName::new(name, &mut Self::NAMES.iter().map(|(listed, _)| *listed))),
+        }
     }
 }
 
@@ -37,6 +37,13 @@ pub struct UnknownName {
     pub name: String,
     /// The names there are, joined by commas.
     pub known: String,
+}
+
+impl UnknownName {
+    /// Not generic: every [`Named`] enum has it.
+    fn new(name: &str, known: &mut dyn Iterator<Item = &'static str>) -> Self {
+        Self { name: name.to_owned(), known: known.collect::<Vec<_>>().join(", ") }
+    }
 }
 
 /// Names every variant of an enum: implements [`Named`](crate::Named), `Display` and `FromStr` for it. A variant without a

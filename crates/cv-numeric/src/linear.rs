@@ -91,7 +91,7 @@ pub fn symmetric_eigen<const N: usize>(m: &SMatrix<f64, N, N>) -> (SVector<f64, 
         }
     }
     let mut order: [usize; N] = std::array::from_fn(|i| i);
-    order.sort_by(|&i, &j| a[(i, i)].total_cmp(&a[(j, j)]));
+    sort_by_value(&mut order, &std::array::from_fn::<_, N, _>(|i| a[(i, i)]));
     let values = SVector::from_fn(|i, _| a[(order[i], order[i])]);
     let mut vectors = SMatrix::<f64, N, N>::zeros();
     for (i, &k) in order.iter().enumerate() {
@@ -100,6 +100,11 @@ pub fn symmetric_eigen<const N: usize>(m: &SMatrix<f64, N, N>) -> (SVector<f64, 
         vectors.set_column(i, &(column * sign));
     }
     (values, vectors)
+}
+
+/// Sorts indices of `values` in ascending order of these. Not generic over their number: sorting is compiled once.
+fn sort_by_value(indices: &mut [usize], values: &[f64]) {
+    indices.sort_by(|&i, &j| values[i].total_cmp(&values[j]));
 }
 
 /// Computes the unit vector `v` that minimizes `vᵀ M v` for a symmetric positive semi-definite `M` of fixed size, such as `AᵀA`.

@@ -53,27 +53,43 @@ impl<I: ExactSizeIterator<Item: Send>, S: Send, N: Fn() -> S + Sync, F: Sync> Pa
     }
 }
 
-/// Results of batches, by the index of their first item.
-struct Results<R>(Mutex<Vec<(usize, Vec<R>)>>);
+/// Results of batches.
+struct Results<R>(Mutex<Batches<R>>);
+
+/// Results of batches in the order in which they ended, and the index of each one's first item.
+struct Batches<R> {
+    starts: Vec<usize>,
+    results: Vec<Vec<R>>,
+}
 
 impl<R> Default for Results<R> {
     fn default() -> Self {
-        Self(Mutex::new(Vec::new()))
+        Self(Mutex::new(Batches { starts: Vec::new(), results: Vec::new() }))
     }
 }
 
 impl<R> Results<R> {
     fn push(&self, start: usize, batch: Vec<R>) {
-        lock(&self.0).push((start, batch));
+        let mut batches = lock(&self.0);
+        batches.starts.push(start);
+        batches.results.push(batch);
     }
 
     fn in_order(self) -> Vec<R> {
-        let mut batches = self.0.into_inner().unwrap_or_else(PoisonError::into_inner);
-        batches.sort_unstable_by_key(|batch| batch.0);
-        let mut all = Vec::with_capacity(batches.iter().map(|batch| batch.1.len()).sum());
-        batches.into_iter().for_each(|batch| all.extend(batch.1));
+        let Batches { starts, mut results } = self.0.into_inner().unwrap_or_else(PoisonError::into_inner);
+        let mut all = Vec::with_capacity(results.iter().map(Vec::len).sum());
+        for i in ascending(&starts) {
+            all.append(&mut results[i]);
+        }
         all
     }
+}
+
+/// Returns the indices of `starts` in ascending order of their values. Not generic: sorting is compiled once.
+fn ascending(starts: &[usize]) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..starts.len()).collect();
+    order.sort_unstable_by_key(|&i| starts[i]);
+    order
 }
 
 /// The error of the first item that failed.

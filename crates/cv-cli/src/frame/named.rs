@@ -5,12 +5,21 @@ use cv_core::Named;
 
 /// Parses a value by its name in the library's table of names, and lists that table in the help.
 pub(crate) fn named<T: Named>() -> impl TypedValueParser<Value = T> {
-    let values = T::NAMES.iter().map(|(name, value)| {
-        let aliases = T::ALIASES.iter().filter(|(_, listed)| listed == name).map(|(alias, _)| *alias);
-        let shown = PossibleValue::new(*name).aliases(aliases);
-        if value.about().is_empty() { shown } else { shown.help(value.about()) }
+    possible_values(&mut T::NAMES.iter().map(|(name, value)| (*name, value.about())), T::ALIASES)
+        .try_map(|name| T::from_name(&name))
+}
+
+/// Lists values by name and description. Not generic: there are dozens of enums.
+fn possible_values(
+    values: &mut dyn Iterator<Item = (&'static str, &'static str)>,
+    aliases: &'static [(&'static str, &'static str)],
+) -> PossibleValuesParser {
+    let shown = values.map(|(name, about)| {
+        let of_name = aliases.iter().filter(|(_, listed)| *listed == name).map(|(alias, _)| *alias);
+        let shown = PossibleValue::new(name).aliases(of_name);
+        if about.is_empty() { shown } else { shown.help(about) }
     });
-    PossibleValuesParser::new(values.collect::<Vec<_>>()).try_map(|name| T::from_name(&name))
+    PossibleValuesParser::new(shown.collect::<Vec<_>>())
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use crate::words::calibration::{lens, note, refusal};
 use serde_json::{Map, Value, json};
 
 /// Maps camera names to values; for a single camera, the value alone.
-fn by_camera(job: &Job, of: impl Fn(usize) -> Value) -> Value {
+fn by_camera(job: &Job, of: &dyn Fn(usize) -> Value) -> Value {
     match job.names.as_slice() {
         [_] => of(0),
         names => Value::Object(names.iter().enumerate().map(|(c, name)| (name.clone(), of(c))).collect()),
@@ -29,9 +29,9 @@ pub(super) fn outcome(job: &Job) -> Outcome {
     if !board.is_empty() {
         all.insert("board".to_owned(), board.into());
     }
-    let mut rms = by_camera(job, |i| json!(c.cameras[i].rms_px));
-    let mut holdout = by_camera(job, |i| json!(c.cameras[i].holdout_rms_px));
-    let mut holdout_all = by_camera(job, |i| json!(c.cameras[i].holdout_all_rms_px));
+    let mut rms = by_camera(job, &|i| json!(c.cameras[i].rms_px));
+    let mut holdout = by_camera(job, &|i| json!(c.cameras[i].holdout_rms_px));
+    let mut holdout_all = by_camera(job, &|i| json!(c.cameras[i].holdout_all_rms_px));
     if job.names.len() == 2 {
         let together =
             [(&mut rms, c.rms_px), (&mut holdout, c.holdout_rms_px), (&mut holdout_all, c.holdout_all_rms_px)];
@@ -91,8 +91,8 @@ pub(super) fn outcome(job: &Job) -> Outcome {
         .with("holdout_rms_px", holdout)
         .with("holdout_all_rms_px", holdout_all)
         .with("noise_px", c.noise_px)
-        .with("lens", by_camera(job, |i| json!(c.cameras[i].camera.distortion.model().info().name)))
-        .with("lenses", by_camera(job, lenses))
+        .with("lens", by_camera(job, &|i| json!(c.cameras[i].camera.distortion.model().info().name)))
+        .with("lenses", by_camera(job, &lenses))
         .with("parameters", all)
         .with(
             "board",
@@ -107,7 +107,7 @@ pub(super) fn outcome(job: &Job) -> Outcome {
         .with("unit", &job.unit)
         .with(
             "uncertainty_px",
-            by_camera(job, |i| {
+            by_camera(job, &|i| {
                 let map = &c.cameras[i].uncertainty;
                 json!({ "median": map.median(), "worst": map.worst().map(|w| w.1) })
             }),
@@ -132,8 +132,8 @@ pub(super) fn outcome(job: &Job) -> Outcome {
             c.cameras[i].from_first.rotation.matrix().row_iter().map(|r| r.iter().copied().collect()).collect()
         };
         return outcome
-            .with("rotation", by_camera(job, |i| json!(rows(i))))
-            .with("translation", by_camera(job, |i| json!(c.cameras[i].from_first.translation.as_slice())));
+            .with("rotation", by_camera(job, &|i| json!(rows(i))))
+            .with("translation", by_camera(job, &|i| json!(c.cameras[i].from_first.translation.as_slice())));
     }
     match c.stereo() {
         None => outcome,
