@@ -184,18 +184,22 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
                 match output {
                     Output::Store(out) => {
                         let ends = Ends { other: &[], running: &mut [], decided: &mut [], best: &mut [], stride: 0 };
-                        extend::<S, PATHS, BLOCKS, SINGLE, 0>(simd, &tile, ongoing, row, least, &mut out[span], ends);
+                        extend::<S, PATHS, BLOCKS, SINGLE, false>(
+                            simd,
+                            &tile,
+                            ongoing,
+                            row,
+                            least,
+                            &mut out[span],
+                            ends,
+                        );
                     }
                     Output::Finish { other, winners, .. } => {
                         let own = &mut sums[..span.len()];
                         let mut best = [(NO_SUM, 0); TILE];
                         let other = &other[span];
                         let ends = selection.ends(frame, mirrored, &columns, other, &mut best);
-                        if mirrored {
-                            extend::<S, PATHS, BLOCKS, SINGLE, 2>(simd, &tile, ongoing, row, least, own, ends);
-                        } else {
-                            extend::<S, PATHS, BLOCKS, SINGLE, 1>(simd, &tile, ongoing, row, least, own, ends);
-                        }
+                        extend::<S, PATHS, BLOCKS, SINGLE, true>(simd, &tile, ongoing, row, least, own, ends);
                         select::<S, BLOCKS, SINGLE>(simd, frame, &best, [own, other], &mut winners[pixels]);
                     }
                 }
@@ -207,10 +211,14 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
         };
         if is_ahead {
             let next = (step + 1 < steps).then(|| row_of(first + step + 1));
-            rayon::join(
-                || extend_row(Some(row_costs)),
-                || next.map(|next| frame.costs::<S, BLOCKS>(simd, next, 0..width, next_costs)),
-            );
+            // Of one type, so that rayon's part is compiled once.
+            let extend: &mut (dyn FnMut() + Send) = &mut || extend_row(Some(&*row_costs));
+            let compute: &mut (dyn FnMut() + Send) = &mut || {
+                if let Some(next) = next {
+                    frame.costs::<S, BLOCKS>(simd, next, 0..width, next_costs);
+                }
+            };
+            rayon::join(extend, compute);
             (row_costs, next_costs) = (next_costs, row_costs);
         } else {
             extend_row(frame.given.map(|given| &given[y * width * depth..][..width * depth]));
@@ -304,9 +312,9 @@ struct Tile<'a> {
 }
 
 /// Extends every path pixel by pixel and stores the sums of the extended ones, in image order. With `KEYS` also adds the sums of the other
-/// sweep and selects winners: 1 from left to right, 2 from right to left.
+/// sweep and selects winners.
 #[simd]
-fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, const KEYS: usize>(
+fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, const KEYS: bool>(
     simd: S,
     tile: &Tile<'_>,
     ongoing: &mut Ongoing,
@@ -338,7 +346,7 @@ fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, 
     if SINGLE {
         held_along[..group].copy_from_slice(along);
         held_behind[..group].copy_from_slice(behind);
-        if KEYS > 0 {
+        if KEYS {
             held_keys[..group].copy_from_slice(running);
         }
     }
@@ -362,7 +370,7 @@ fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, 
         let mut behind_step = Step::new(simd, splat(before[1][at]), splat(jumps[2][at]));
         let mut ahead_step = Step::new(simd, splat(before[2][at]), splat(jumps[3][at]));
         for start in (0..depth).step_by(group) {
-            let running = if SINGLE || KEYS == 0 { &mut held_keys[..group] } else { &mut running[start..][..group] };
+            let running = if SINGLE || !KEYS { &mut held_keys[..group] } else { &mut running[start..][..group] };
             let mut keys = Keys::begin(simd, running, n);
             for v in 0..n {
                 let place = (start, v, group);
@@ -387,13 +395,13 @@ fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, 
                     sum = sum.saturating_add(extended);
                 }
                 sum.store_slice(&mut sums[to..][..lanes]);
-                if KEYS > 0 {
+                if KEYS {
                     let other = S::u8s::from_slice(simd, &other[at * depth + to..][..lanes]);
-                    keys.add::<KEYS>(simd, [sum, other], &ids, running, v, n);
+                    keys.add(simd, [sum, other], &ids, running, (v, n), tile.mirrored);
                 }
             }
-            if KEYS > 0 {
-                decided[start / group * decided_stride + at] = running[if KEYS == 2 { 0 } else { group - 1 }];
+            if KEYS {
+                decided[start / group * decided_stride + at] = running[if tile.mirrored { 0 } else { group - 1 }];
                 best[at] = keys.end(best[at], start);
             }
         }
@@ -407,7 +415,7 @@ fn extend<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool, 
     if SINGLE {
         along.copy_from_slice(&held_along[..group]);
         behind.copy_from_slice(&held_behind[..group]);
-        if KEYS > 0 {
+        if KEYS {
             running.copy_from_slice(&held_keys[..group]);
         }
     }

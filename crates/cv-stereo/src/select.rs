@@ -163,16 +163,16 @@ impl<S: Simd> Keys<S> {
         Self { even, odd: vector(simd, running, n - 1), first, middle, best: none }
     }
 
-    /// Adds the sums of both sweeps at vector `v` of `n`. `ids` are the indices of the vectors of keys.
+    /// Adds the sums of both sweeps at vector `v` of `n`, from left to right or `mirrored`. `ids` are the indices of the vectors of keys.
     #[inline(always)]
-    pub(crate) fn add<const KEYS: usize>(
+    pub(crate) fn add(
         &mut self,
         simd: S,
         [own, other]: [S::u8s; 2],
         ids: &[S::u16s; 2 * MAX_VECTORS],
         running: &mut [u16],
-        v: usize,
-        n: usize,
+        (v, n): (usize, usize),
+        mirrored: bool,
     ) {
         // Bytes at even positions, and at odd ones.
         let [own, other] = [own.bitcast::<S::u16s>(), other.bitcast::<S::u16s>()];
@@ -181,7 +181,7 @@ impl<S: Simd> Keys<S> {
         let odd = (((own >> 8) + (other >> 8)) << KEY_BITS) | ids[n + v];
         self.best = self.best.min(even).min(odd);
         let here = [vector(simd, running, v), vector(simd, running, n + v)];
-        let [before_even, before_odd] = if KEYS == 1 {
+        let [before_even, before_odd] = if !mirrored {
             [self.even, self.odd]
         } else if v + 1 < n {
             [vector(simd, running, v + 1), vector(simd, running, n + v + 1)]
