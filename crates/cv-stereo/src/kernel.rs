@@ -211,14 +211,14 @@ fn rows<S: Simd, const PATHS: usize, const BLOCKS: usize, const SINGLE: bool>(
         };
         if is_ahead {
             let next = (step + 1 < steps).then(|| row_of(first + step + 1));
-            // Of one type, so that rayon's part is compiled once.
-            let extend: &mut (dyn FnMut() + Send) = &mut || extend_row(Some(&*row_costs));
-            let compute: &mut (dyn FnMut() + Send) = &mut || {
+            // Trait objects, so that rayon's part is compiled once.
+            let this_row: &mut (dyn FnMut() + Send) = &mut || extend_row(Some(&*row_costs));
+            let costs_of_next: &mut (dyn FnMut() + Send) = &mut || {
                 if let Some(next) = next {
                     frame.costs::<S, BLOCKS>(simd, next, 0..width, next_costs);
                 }
             };
-            rayon::join(extend, compute);
+            rayon::join(this_row, costs_of_next);
             (row_costs, next_costs) = (next_costs, row_costs);
         } else {
             extend_row(frame.given.map(|given| &given[y * width * depth..][..width * depth]));

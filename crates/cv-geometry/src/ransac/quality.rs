@@ -4,16 +4,16 @@ use super::{BlockOf, Estimator, Msac, RansacData, Score, Scorer, Scoring, TukeyB
 use crate::match_blocks::LANES;
 use fearless_simd::{Level, dispatch};
 
-/// Sums the `loss` of `u = (residual / threshold)²` over all blocks; returns [`Score::WORST`] as soon as the sum exceeds `limit`.
+/// Sums the losses over all blocks; returns [`Score::WORST`] as soon as the sum exceeds `limit`.
 ///
 /// Lanes are accumulated separately in a fixed order and no product is fused, so all instruction sets give identical
 /// results.
 #[inline(always)]
-fn score_blocks<E: Estimator>(
+fn score_blocks<E: Estimator, C: Scorer + ?Sized>(
     kernel: &E::Kernel,
     blocks: &[BlockOf<E>],
     padding: usize,
-    loss: impl Fn(f32) -> f32,
+    scorer: &C,
     inverse_threshold2: f32,
     limit: f32,
 ) -> Score {
@@ -26,7 +26,7 @@ fn score_blocks<E: Estimator>(
             let r2 = E::squared_residuals(kernel, block);
             for i in 0..LANES {
                 let u = r2[i] * inverse_threshold2;
-                losses[i] += loss(u);
+                losses[i] += scorer.loss(u);
                 inliers[i] += u32::from(u < 1.0);
             }
         }
@@ -92,17 +92,11 @@ impl<'a, E: Estimator> Quality<'a, E> {
         let kernel = self.estimator.kernel(model);
         let (blocks, padding, scale) = (self.estimator.data().blocks(), self.padding, self.inverse_threshold2);
         // The built-in losses are inlined into the loop.
-        match self.scoring {
-            Scoring::Msac => dispatch!(self.level, _simd => {
-                score_blocks::<E>(&kernel, blocks, padding, |u| Msac.loss(u), scale, limit)
-            }),
-            Scoring::TukeyBiweight => dispatch!(self.level, _simd => {
-                score_blocks::<E>(&kernel, blocks, padding, |u| TukeyBiweight.loss(u), scale, limit)
-            }),
-            Scoring::Other(scorer) => dispatch!(self.level, _simd => {
-                score_blocks::<E>(&kernel, blocks, padding, |u| scorer.loss(u), scale, limit)
-            }),
-        }
+        dispatch!(self.level, _simd => match self.scoring {
+            Scoring::Msac => score_blocks::<E, _>(&kernel, blocks, padding, &Msac, scale, limit),
+            Scoring::TukeyBiweight => score_blocks::<E, _>(&kernel, blocks, padding, &TukeyBiweight, scale, limit),
+            Scoring::Other(scorer) => score_blocks::<E, _>(&kernel, blocks, padding, scorer, scale, limit),
+        })
     }
 
     /// Counts the data of `blocks` within `radius` thresholds, half of that, a quarter of that, and so on.
