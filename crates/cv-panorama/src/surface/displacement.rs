@@ -92,9 +92,13 @@ impl DisplacementField {
             let (a, b) = (self.source_shift[row + x], self.source_shift[row + self.columns + x]);
             [a[0] + (b[0] - a[0]) * fy, a[1] + (b[1] - a[1]) * fy]
         };
-        let (start, step) = (((left - self.left) / self.spacing) as f32, (1.0 / self.spacing) as f32);
+        // Exact differences of columns, so that a pixel has the same position in any part of a row.
+        let whole = self.left.floor();
+        let (column, fraction) = ((left - whole) as f32, (self.left - whole) as f32);
+        let step = (1.0 / self.spacing) as f32;
         let last = self.columns as f32 - 1.0001;
-        let position = |i: usize| (start + i as i32 as f32 * step).max(0.0).min(last);
+        let position = |i: usize| ((column + i as i32 as f32 - fraction) * step).max(0.0).min(last);
+        let start = (column - fraction) * step;
         let mut first = 0;
         // The pixels of a cell at a time, in a loop that is vectorized.
         while first < us.len() {
@@ -217,6 +221,17 @@ mod tests {
                 // Single-precision rounding of numbers up to ten.
                 prop_assert!((f64::from(*u) - 5.0 - want.y).abs() < 1e-4 && (f64::from(*v) + 3.0 - want.x).abs() < 1e-4);
             }
+        }
+
+        #[test]
+        fn a_pixel_has_the_same_displacement_in_any_part_of_a_row(y in 20..79_usize, split in 1..99_usize, spacing in 8.0..30.0_f64) {
+            let field = affine(spacing);
+            let (mut us, mut vs) = (vec![5.0; 100], vec![-3.0; 100]);
+            let (mut parts_u, mut parts_v) = (us.clone(), vs.clone());
+            field.add_row(y as f64, 10.0, &mut us, &mut vs);
+            field.add_row(y as f64, 10.0, &mut parts_u[..split], &mut parts_v[..split]);
+            field.add_row(y as f64, 10.0 + split as f64, &mut parts_u[split..], &mut parts_v[split..]);
+            prop_assert!(us == parts_u && vs == parts_v);
         }
 
         #[test]
