@@ -1,9 +1,10 @@
 //! Encoding images as PNG and TIFF, and by the extension of the file's name.
 
+use std::borrow::Cow;
 use std::io::Write;
 use std::path::Path;
 
-use cv_core::ImageView;
+use cv_core::{ImageView, Sample};
 use png::{BitDepth, ColorType, Compression, Filter};
 
 use crate::encode_jpeg::{JPEG_QUALITY, encode_jpeg_parts};
@@ -13,12 +14,12 @@ use crate::files::write_bytes;
 use crate::{FormatError, IoError, Metadata};
 
 /// Width, height, color type, bit depth, and the samples row-major, big-endian, without padding.
-pub(crate) type Parts = (usize, usize, ColorType, BitDepth, Vec<u8>);
+pub(crate) type Parts<'a> = (usize, usize, ColorType, BitDepth, Cow<'a, [u8]>);
 
 /// Image types that can be written as PNG: views of 1, 3 or 4 channels of `u8` or `u16`, and masks.
 pub trait PngPixels: sealed::Sealed {
     #[doc(hidden)]
-    fn parts(&self) -> Parts;
+    fn parts(&self) -> Parts<'_>;
 }
 
 mod sealed {
@@ -26,26 +27,49 @@ mod sealed {
 }
 
 macro_rules! png_pixels {
-    ($sample:ty, $channels:literal, $color:ident, $depth:ident, $push:expr) => {
+    ($sample:ty, $channels:literal, $color:ident, $depth:ident, $bytes:expr) => {
         impl sealed::Sealed for ImageView<'_, $sample, $channels> {}
         impl PngPixels for ImageView<'_, $sample, $channels> {
-            fn parts(&self) -> Parts {
-                let mut bytes = Vec::with_capacity(self.width() * self.height() * $channels * size_of::<$sample>());
-                let push: fn(&mut Vec<u8>, &[$sample]) = $push;
-                (0..self.height()).for_each(|y| push(&mut bytes, self.row(y)));
-                (self.width(), self.height(), ColorType::$color, BitDepth::$depth, bytes)
+            fn parts(&self) -> Parts<'_> {
+                (self.width(), self.height(), ColorType::$color, BitDepth::$depth, $bytes(self))
             }
         }
     };
 }
 
-png_pixels!(u8, 1, Grayscale, Eight, |out, row| out.extend_from_slice(row));
-png_pixels!(u8, 3, Rgb, Eight, |out, row| out.extend_from_slice(row));
-png_pixels!(u8, 4, Rgba, Eight, |out, row| out.extend_from_slice(row));
-png_pixels!(bool, 1, Grayscale, Eight, |out, row| out.extend(row.iter().map(|&v| if v { 255u8 } else { 0 })));
-png_pixels!(u16, 1, Grayscale, Sixteen, |out, row| out.extend(row.iter().flat_map(|v| v.to_be_bytes())));
-png_pixels!(u16, 3, Rgb, Sixteen, |out, row| out.extend(row.iter().flat_map(|v| v.to_be_bytes())));
-png_pixels!(u16, 4, Rgba, Sixteen, |out, row| out.extend(row.iter().flat_map(|v| v.to_be_bytes())));
+png_pixels!(u8, 1, Grayscale, Eight, samples);
+png_pixels!(u8, 3, Rgb, Eight, samples);
+png_pixels!(u8, 4, Rgba, Eight, samples);
+png_pixels!(bool, 1, Grayscale, Eight, |mask| copied(mask, |out, row| out.extend(row.iter().map(|&v| if v {
+    255
+} else {
+    0
+}))));
+png_pixels!(u16, 1, Grayscale, Sixteen, big_endian);
+png_pixels!(u16, 3, Rgb, Sixteen, big_endian);
+png_pixels!(u16, 4, Rgba, Sixteen, big_endian);
+
+/// Returns the samples row-major without padding: copied only from views with padding.
+fn samples<'a, const C: usize>(view: &ImageView<'a, u8, C>) -> Cow<'a, [u8]> {
+    let ((samples, stride), width) = (view.strided_samples(), C * view.width());
+    match samples.get(..width * view.height()) {
+        Some(dense) if stride == width => Cow::Borrowed(dense),
+        _ => copied(view, |out, row| out.extend_from_slice(row)),
+    }
+}
+
+fn big_endian<const C: usize>(view: &ImageView<'_, u16, C>) -> Cow<'static, [u8]> {
+    copied(view, |out, row| out.extend(row.iter().flat_map(|v| v.to_be_bytes())))
+}
+
+fn copied<T: Sample, const C: usize>(
+    view: &ImageView<'_, T, C>,
+    extend: impl Fn(&mut Vec<u8>, &[T]),
+) -> Cow<'static, [u8]> {
+    let mut bytes = Vec::with_capacity(view.width() * view.height() * C * size_of::<T>());
+    (0..view.height()).for_each(|y| extend(&mut bytes, view.row(y)));
+    Cow::Owned(bytes)
+}
 
 /// Encodes a PNG file.
 ///
@@ -57,7 +81,7 @@ pub fn encode_png(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
 
 /// Not generic, so that the encoder is compiled once and not for each pixel type.
 pub(crate) fn encode_png_parts(
-    (width, height, color, depth, pixels): Parts,
+    (width, height, color, depth, pixels): Parts<'_>,
     metadata: &Metadata,
     dpi: Option<f64>,
 ) -> Result<Vec<u8>, FormatError> {
@@ -135,7 +159,10 @@ pub fn encode_tiff(view: impl PngPixels) -> Result<Vec<u8>, FormatError> {
     encode_tiff_parts(view.parts(), &Metadata::default())
 }
 
-fn encode_tiff_parts((width, height, color, depth, bytes): Parts, metadata: &Metadata) -> Result<Vec<u8>, FormatError> {
+fn encode_tiff_parts(
+    (width, height, color, depth, bytes): Parts<'_>,
+    metadata: &Metadata,
+) -> Result<Vec<u8>, FormatError> {
     let depth = if depth == BitDepth::Sixteen { 2 } else { 1 };
     encode_samples(&Samples { width, height, channels: color.samples(), depth, bytes: &bytes }, metadata)
 }

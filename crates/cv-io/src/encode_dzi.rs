@@ -147,7 +147,7 @@ impl DziWriter {
                 let row = &rows[(y - top) * width * channels..][..width * channels];
                 tile.extend_from_slice(&row[xs.start * channels..xs.end * channels]);
             }
-            let parts = (xs.len(), ys.len(), self.color, BitDepth::Eight, tile);
+            let parts = (xs.len(), ys.len(), self.color, BitDepth::Eight, tile.into());
             let bytes = if self.color == ColorType::Rgba {
                 encode_png_parts(parts, &Metadata::default(), None)?
             } else {

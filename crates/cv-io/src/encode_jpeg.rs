@@ -42,7 +42,7 @@ pub fn write_jpeg(path: impl AsRef<Path>, view: impl JpegPixels) -> Result<(), I
 }
 
 pub(crate) fn encode_jpeg_parts(
-    (width, height, color, depth, pixels): Parts,
+    (width, height, color, depth, pixels): Parts<'_>,
     quality: u8,
     metadata: &Metadata,
 ) -> Result<Vec<u8>, FormatError> {
@@ -273,7 +273,7 @@ mod tests {
     use cv_core::Image;
 
     /// Encodes an image whose rows arrive `at_once`.
-    fn encoded(parts: &Parts, quality: u8, at_once: usize) -> Vec<u8> {
+    fn encoded(parts: &Parts<'_>, quality: u8, at_once: usize) -> Vec<u8> {
         let (width, height, color, depth, pixels) = parts;
         let mut bytes = Vec::new();
         let mut writer =

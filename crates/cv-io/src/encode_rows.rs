@@ -71,7 +71,7 @@ impl RowWriter<'_> {
         self.write_parts(rows.parts())
     }
 
-    pub(crate) fn write_parts(&mut self, (width, rows, color, depth, bytes): Parts) -> Result<(), FormatError> {
+    pub(crate) fn write_parts(&mut self, (width, rows, color, depth, bytes): Parts<'_>) -> Result<(), FormatError> {
         let wrong = || FormatError::corrupt("image", format!("{width}×{rows} more pixels do not fit its size"));
         let size = self.size.filter(|size| size.0 == width && rows <= self.rows_left).ok_or_else(wrong)?;
         self.rows_left -= rows;
