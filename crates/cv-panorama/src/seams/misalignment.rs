@@ -10,7 +10,7 @@ pub(super) const PATCH_RADIUS: usize = 4;
 /// Side of a patch.
 pub(super) const PATCH_SIDE: usize = 2 * PATCH_RADIUS + 1;
 /// Grid spacing of the patches in preview pixels.
-const SPACING: usize = 3;
+pub(super) const SPACING: usize = 3;
 /// Minimum root mean square contrast of a patch, in gray levels: low-texture patches are skipped.
 const MIN_CONTRAST: f32 = 4.0;
 /// Minimum correlation of corresponding patches.

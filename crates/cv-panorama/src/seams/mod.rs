@@ -10,6 +10,7 @@ mod breaks;
 mod contradiction;
 mod cost;
 mod misalignment;
+mod pair_costs;
 mod transient;
 mod upsample;
 mod windows;
@@ -22,11 +23,11 @@ use crate::blend::NO_PHOTO;
 use crate::rows::{for_each_row, is_check_due};
 use crate::surface::{Bounds, Piece, Preview, WarpedPhoto};
 use alpha_expansion::{BeyondCost, Labeling};
-use contradiction::contradiction;
 use cost::difference;
 use cv_core::{Cancelled, Image, Progress, Stage, named};
 use cv_parallel::prelude::*;
 use misalignment::Misalignments;
+use pair_costs::PairCosts;
 use transient::transient_costs;
 
 /// Seam finding.
@@ -50,11 +51,6 @@ const ECCENTRICITY_COST: f32 = 4.0;
 const CLIPPED_COST: f32 = 36.0;
 /// Data term of a clipped pixel where radiance is computed: more than a seam along the border of a photograph.
 const CLIPPED_RADIANCE_COST: f32 = 400.0;
-
-/// Smoothness term per canvas pixel of misalignment beyond the first, in addition to the color difference: 15 gray levels in one channel.
-const MISALIGNMENT_COST: f32 = 4.0 * 15.0;
-/// Misalignment beyond the first canvas pixel at which the cost is truncated: then it equals that of the border of a photograph.
-const MAX_MISALIGNMENT_PX: f32 = 3.0;
 
 /// Returns the bounding box of each of `n` labels.
 pub(crate) fn label_bounds(labels: &Image<u16, 1>, n: usize) -> Vec<Option<Bounds>> {
@@ -104,7 +100,7 @@ pub(crate) fn on_preview(
     let stage = Stage::new(progress, "seams", 1 + levels.len())?;
     let found = Misalignments::find(preview, photo_of, &stage)?;
     stage.add(1)?;
-    let pieces: Vec<Option<&WarpedPhoto>> = preview.pieces.iter().map(|p| Some(&p.warped)).collect();
+    let costs = PairCosts::new(preview, &found);
     let mut coarse: Option<Image<u16, 1>> = None;
     for (level, side) in levels {
         let (mut labels, near) = match &coarse {
@@ -120,25 +116,16 @@ pub(crate) fn on_preview(
         };
         // The maximum over 2 × 2 preview pixels: their mean would hide a thin object that the seam cuts. Of larger pixels the mean of these: their maximum is
         // large almost everywhere.
-        let differ_within = |a: usize, b: usize, (left, top): (usize, usize), block: usize| {
-            let mut most = 0;
-            for (x, y) in (top..top + block).flat_map(|y| (left..left + block).map(move |x| (x, y))) {
-                let off = preview.step as f32 * found.at(a, b, x, y) - 1.0;
-                let misaligned = (MISALIGNMENT_COST * off.clamp(0.0, MAX_MISALIGNMENT_PX)) as i32;
-                let cost = difference(pieces[a], pieces[b], x, y);
-                let contradiction = contradiction(&preview.pieces[a], &preview.pieces[b], (x, y), cost);
-                most = most.max(cost + misaligned + contradiction);
-            }
-            most
-        };
         let differ = |a: usize, b: usize, x: usize, y: usize| {
+            let costs = costs.of(a, b);
+            let most = |x: usize, y: usize| {
+                costs.at(x, y).max(costs.at(x + 1, y)).max(costs.at(x, y + 1)).max(costs.at(x + 1, y + 1))
+            };
             let (x, y) = (side * x, side * y);
             match side {
-                4 => {
-                    let four = [(x, y), (x + 2, y), (x, y + 2), (x + 2, y + 2)];
-                    four.into_iter().map(|place| differ_within(a, b, place, 2)).sum::<i32>() / 4
-                }
-                _ => differ_within(a, b, (x, y), side),
+                1 => costs.at(x, y),
+                2 => most(x, y),
+                _ => (most(x, y) + most(x + 2, y) + most(x, y + 2) + most(x + 2, y + 2)) / 4,
             }
         };
         let transients = removes_transients.then(|| transient_costs(level));
