@@ -22,8 +22,11 @@ pub fn bilinear_lanes(image: &GrayU8, us: &[f32; SAMPLE_LANES], vs: &[f32; SAMPL
     let (mut above, mut below) = ([0_u32; SAMPLE_LANES], [0_u32; SAMPLE_LANES]);
     for k in 0..SAMPLE_LANES {
         let at = ys[k] as usize * width + xs[k] as usize;
-        let pair = |at: usize| samples.get(at..).and_then(|s| s.first_chunk()).copied().map_or(0, u16::from_le_bytes);
-        (above[k], below[k]) = (pair(at).into(), pair(at + width).into());
+        // One check of the length.
+        if let Some(four) = samples.get(at..at + width + 2) {
+            let pair = |i: usize| u16::from_le_bytes([four[i], four[i + 1]]).into();
+            (above[k], below[k]) = (pair(0), pair(width));
+        }
     }
     let mut values = [0.0; SAMPLE_LANES];
     for k in 0..SAMPLE_LANES {

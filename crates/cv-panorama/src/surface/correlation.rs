@@ -21,9 +21,9 @@ pub(crate) struct Template {
 
 impl Template {
     pub(crate) fn new(side: usize, patch: &[f32]) -> Self {
-        let mean = patch.iter().sum::<f32>() / patch.len() as f32;
+        let mean = sum_of(patch, |v| v) / patch.len() as f32;
         let centered: Vec<f32> = patch.iter().map(|v| v - mean).collect();
-        let energy = centered.iter().map(|v| v * v).sum();
+        let energy = sum_of(&centered, |v| v * v);
         Self { side, centered, energy }
     }
 
@@ -107,6 +107,22 @@ impl Template {
         let count = self.centered.len() as f32;
         product / (self.energy * (squares - sum * sum / count).max(count / 12.0)).sqrt()
     }
+}
+
+/// Sums a term of all values in eight partial sums, which unlike one do not wait for each other.
+#[inline]
+fn sum_of(values: &[f32], term: impl Fn(f32) -> f32) -> f32 {
+    let mut sums = [0.0_f32; 8];
+    let (chunks, rest) = values.as_chunks::<8>();
+    for chunk in chunks {
+        for k in 0..8 {
+            sums[k] += term(chunk[k]);
+        }
+    }
+    for (sum, v) in sums.iter_mut().zip(rest) {
+        *sum += term(*v);
+    }
+    sums.iter().sum()
 }
 
 /// Correlations within this of the maximum make it ambiguous.

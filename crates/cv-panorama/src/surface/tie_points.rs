@@ -63,20 +63,7 @@ pub(super) fn solve(
         std::array::from_fn(term)
     };
     let terms: Vec<Term> = ties.iter().chain(continuity).map(|t| (vertices(t), t.difference, t.normal)).collect();
-    let mut edges = Vec::new();
-    for (f, offset) in fields.iter().zip(&offsets) {
-        for y in 0..f.rows {
-            for x in 0..f.columns {
-                let i = offset + y * f.columns + x;
-                if x + 1 < f.columns {
-                    edges.push((i, i + 1));
-                }
-                if y + 1 < f.rows {
-                    edges.push((i, i + f.columns));
-                }
-            }
-        }
-    }
+    let grids: Vec<(usize, usize)> = fields.iter().map(|f| (f.columns, f.rows)).collect();
     let mut d: Vec<Vector2<f64>> = fields.iter().flat_map(|f| f.displacement.iter().copied()).collect();
     let left = |d: &[Vector2<f64>], t: &[(usize, f64); 8]| -> Vector2<f64> { t.iter().map(|&(i, w)| d[i] * w).sum() };
     // Without robust weights the rounds are the same.
@@ -90,12 +77,10 @@ pub(super) fn solve(
         };
         let weights = terms[..ties.len()].iter().map(weight);
         let weights: Vec<f64> = weights.chain(continuity.iter().map(|_| CONTINUITY)).collect();
-        let apply = |x: &[Vector2<f64>]| {
-            let mut out: Vec<Vector2<f64>> = x.iter().map(|v| v * damping).collect();
-            for &(i, j) in &edges {
-                let pull = (x[i] - x[j]) * SMOOTHNESS;
-                out[i] += pull;
-                out[j] -= pull;
+        let apply = |x: &[Vector2<f64>], out: &mut [Vector2<f64>]| {
+            for ((columns, rows), offset) in grids.iter().zip(&offsets) {
+                let vertices = *offset..offset + columns * rows;
+                smooth(&x[vertices.clone()], *columns, damping, &mut out[vertices]);
             }
             for ((t, _, normal), w) in terms.iter().zip(&weights) {
                 let value = TiePoint::measured(*normal, left(x, t) * *w);
@@ -103,13 +88,15 @@ pub(super) fn solve(
                     out[i] += value * c;
                 }
             }
-            out
         };
         let mut right = vec![Vector2::zeros(); n];
         let mut diagonal = vec![Vector2::repeat(damping); n];
-        for &(i, j) in &edges {
-            diagonal[i] += Vector2::repeat(SMOOTHNESS);
-            diagonal[j] += Vector2::repeat(SMOOTHNESS);
+        for ((columns, rows), offset) in grids.iter().zip(&offsets) {
+            for i in 0..columns * rows {
+                let (x, y) = (i % columns, i / columns);
+                let neighbors = [x > 0, x + 1 < *columns, y > 0, y + 1 < *rows].into_iter().filter(|n| *n).count();
+                diagonal[offset + i] += Vector2::repeat(SMOOTHNESS * neighbors as f64);
+            }
         }
         for ((t, want, normal), w) in terms.iter().zip(&weights) {
             let want = TiePoint::measured(*normal, *want);
@@ -129,10 +116,31 @@ pub(super) fn solve(
     Ok(())
 }
 
+/// Sets `out` to the product of the matrix of damping and smoothness with the displacements `x` of a grid, row-major.
+fn smooth(x: &[Vector2<f64>], columns: usize, damping: f64, out: &mut [Vector2<f64>]) {
+    for (i, (row, out)) in x.chunks_exact(columns).zip(out.chunks_exact_mut(columns)).enumerate() {
+        for (out, v) in out.iter_mut().zip(row) {
+            *out = v * damping;
+        }
+        for k in 1..columns {
+            out[k] += (row[k] - row[k - 1]) * SMOOTHNESS;
+        }
+        for k in 1..columns {
+            out[k - 1] += (row[k - 1] - row[k]) * SMOOTHNESS;
+        }
+        let above = i.checked_sub(1).map(|i| &x[i * columns..]);
+        for other in above.into_iter().chain(x.get((i + 1) * columns..).filter(|below| !below.is_empty())) {
+            for ((out, v), w) in out.iter_mut().zip(row).zip(other) {
+                *out += (v - w) * SMOOTHNESS;
+            }
+        }
+    }
+}
+
 /// Solves by conjugate gradients with Jacobi preconditioner, starting from `x`; ends at a squared residual of `tolerance` relative to the right-hand side, since
-/// the initial residual may be small.
+/// the initial residual may be small. `apply` sets its second argument to the product of the matrix with the first.
 fn conjugate_gradients(
-    apply: impl Fn(&[Vector2<f64>]) -> Vec<Vector2<f64>>,
+    apply: impl Fn(&[Vector2<f64>], &mut [Vector2<f64>]),
     right: &[Vector2<f64>],
     diagonal: &[Vector2<f64>],
     x: &mut [Vector2<f64>],
@@ -140,14 +148,19 @@ fn conjugate_gradients(
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
     let dot = |a: &[Vector2<f64>], b: &[Vector2<f64>]| -> f64 { a.iter().zip(b).map(|(a, b)| a.dot(b)).sum() };
-    let scaled =
-        |r: &[Vector2<f64>]| -> Vec<Vector2<f64>> { r.iter().zip(diagonal).map(|(r, d)| r.component_div(d)).collect() };
-    let product = apply(x);
+    let scale = |r: &[Vector2<f64>], z: &mut [Vector2<f64>]| {
+        for ((z, r), d) in z.iter_mut().zip(r).zip(diagonal) {
+            *z = r.component_div(d);
+        }
+    };
+    let (mut z, mut product) = (vec![Vector2::zeros(); x.len()], vec![Vector2::zeros(); x.len()]);
+    scale(right, &mut z);
+    let whole = dot(right, &z);
+    apply(x, &mut product);
     let mut r: Vec<Vector2<f64>> = right.iter().zip(&product).map(|(b, a)| b - a).collect();
-    let mut z = scaled(&r);
+    scale(&r, &mut z);
     let mut direction = z.clone();
     let mut rz = dot(&r, &z);
-    let whole = dot(right, &scaled(right));
     for iteration in 0..200 {
         // An iteration on a hundred thousand matches is some milliseconds.
         if iteration % 8 == 0 {
@@ -156,13 +169,13 @@ fn conjugate_gradients(
         if rz <= tolerance * whole.max(1e-6) {
             break;
         }
-        let product = apply(&direction);
+        apply(&direction, &mut product);
         let step = rz / dot(&direction, &product).max(1e-300);
         for i in 0..x.len() {
             x[i] += direction[i] * step;
             r[i] -= product[i] * step;
         }
-        z = scaled(&r);
+        scale(&r, &mut z);
         let next = dot(&r, &z);
         let keep = next / rz.max(1e-300);
         for (p, z) in direction.iter_mut().zip(&z) {
@@ -192,8 +205,10 @@ mod tests {
         }
         let right: Vec<Vector2<f64>> =
             (0..n).map(|i| Vector2::new((i as f64).sin(), (2.0 * i as f64).cos() * 10.0)).collect();
-        let apply = |x: &[Vector2<f64>]| -> Vec<Vector2<f64>> {
-            (0..n).map(|i| (0..n).map(|j| x[j] * matrix[(i, j)]).sum()).collect()
+        let apply = |x: &[Vector2<f64>], out: &mut [Vector2<f64>]| {
+            for (i, out) in out.iter_mut().enumerate() {
+                *out = (0..n).map(|j| x[j] * matrix[(i, j)]).sum();
+            }
         };
         let diagonal: Vec<Vector2<f64>> = (0..n).map(|i| Vector2::repeat(matrix[(i, i)])).collect();
         let mut x = vec![Vector2::new(0.5, -0.5); n];
