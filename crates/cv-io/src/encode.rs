@@ -40,11 +40,7 @@ macro_rules! png_pixels {
 png_pixels!(u8, 1, Grayscale, Eight, samples);
 png_pixels!(u8, 3, Rgb, Eight, samples);
 png_pixels!(u8, 4, Rgba, Eight, samples);
-png_pixels!(bool, 1, Grayscale, Eight, |mask| copied(mask, |out, row| out.extend(row.iter().map(|&v| if v {
-    255
-} else {
-    0
-}))));
+png_pixels!(bool, 1, Grayscale, Eight, black_and_white);
 png_pixels!(u16, 1, Grayscale, Sixteen, big_endian);
 png_pixels!(u16, 3, Rgb, Sixteen, big_endian);
 png_pixels!(u16, 4, Rgba, Sixteen, big_endian);
@@ -56,6 +52,10 @@ fn samples<'a, const C: usize>(view: &ImageView<'a, u8, C>) -> Cow<'a, [u8]> {
         Some(dense) if stride == width => Cow::Borrowed(dense),
         _ => copied(view, |out, row| out.extend_from_slice(row)),
     }
+}
+
+fn black_and_white(mask: &ImageView<'_, bool, 1>) -> Cow<'static, [u8]> {
+    copied(mask, |out, row| out.extend(row.iter().map(|&v| if v { 255 } else { 0 })))
 }
 
 fn big_endian<const C: usize>(view: &ImageView<'_, u16, C>) -> Cow<'static, [u8]> {

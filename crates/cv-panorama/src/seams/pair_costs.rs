@@ -39,7 +39,7 @@ impl<'a> PairCosts<'a> {
         Self { preview, misalignments, pairs }
     }
 
-    /// Returns the costs of two pieces. O(overlap) for the first time.
+    /// Returns the costs of two pieces. O(overlap) the first time.
     #[inline]
     pub(super) fn of(&self, a: usize, b: usize) -> &PairCost {
         let (a, b) = (a.min(b), a.max(b));

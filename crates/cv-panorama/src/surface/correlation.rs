@@ -109,7 +109,7 @@ impl Template {
     }
 }
 
-/// Sums a term of all values in eight partial sums, which unlike one do not wait for each other.
+/// Sums a term of all values, in eight partial sums: additions to one sum wait for each other.
 #[inline]
 fn sum_of(values: &[f32], term: impl Fn(f32) -> f32) -> f32 {
     let mut sums = [0.0_f32; 8];
