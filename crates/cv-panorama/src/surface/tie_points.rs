@@ -2,6 +2,7 @@
 
 use crate::surface::DisplacementField;
 use cv_core::{Cancelled, Point2, Stage, Vector2};
+use std::ops::Range;
 
 /// A correspondence of two placements: the difference of their displacements at two canvas positions.
 #[derive(Clone, Copy)]
@@ -63,7 +64,10 @@ pub(super) fn solve(
         std::array::from_fn(term)
     };
     let terms: Vec<Term> = ties.iter().chain(continuity).map(|t| (vertices(t), t.difference, t.normal)).collect();
-    let grids: Vec<(usize, usize)> = fields.iter().map(|f| (f.columns, f.rows)).collect();
+    // The columns and the vertices of each field.
+    let grids: Vec<(usize, Range<usize>)> =
+        fields.iter().zip(offsets.windows(2)).map(|(f, ends)| (f.columns, ends[0]..ends[1])).collect();
+    let own: Vec<f64> = fields.iter().flat_map(|f| smooth_diagonal(f.columns, f.rows, damping)).collect();
     let mut d: Vec<Vector2<f64>> = fields.iter().flat_map(|f| f.displacement.iter().copied()).collect();
     let left = |d: &[Vector2<f64>], t: &[(usize, f64); 8]| -> Vector2<f64> { t.iter().map(|&(i, w)| d[i] * w).sum() };
     // Without robust weights the rounds are the same.
@@ -78,9 +82,8 @@ pub(super) fn solve(
         let weights = terms[..ties.len()].iter().map(weight);
         let weights: Vec<f64> = weights.chain(continuity.iter().map(|_| CONTINUITY)).collect();
         let apply = |x: &[Vector2<f64>], out: &mut [Vector2<f64>]| {
-            for ((columns, rows), offset) in grids.iter().zip(&offsets) {
-                let vertices = *offset..offset + columns * rows;
-                smooth(&x[vertices.clone()], *columns, damping, &mut out[vertices]);
+            for (columns, vertices) in &grids {
+                smooth(&x[vertices.clone()], *columns, damping, &mut out[vertices.clone()]);
             }
             for ((t, _, normal), w) in terms.iter().zip(&weights) {
                 let value = TiePoint::measured(*normal, left(x, t) * *w);
@@ -90,14 +93,7 @@ pub(super) fn solve(
             }
         };
         let mut right = vec![Vector2::zeros(); n];
-        let mut diagonal = vec![Vector2::repeat(damping); n];
-        for ((columns, rows), offset) in grids.iter().zip(&offsets) {
-            for i in 0..columns * rows {
-                let (x, y) = (i % columns, i / columns);
-                let neighbors = [x > 0, x + 1 < *columns, y > 0, y + 1 < *rows].into_iter().filter(|n| *n).count();
-                diagonal[offset + i] += Vector2::repeat(SMOOTHNESS * neighbors as f64);
-            }
-        }
+        let mut diagonal: Vec<Vector2<f64>> = own.iter().map(|v| Vector2::repeat(*v)).collect();
         for ((t, want, normal), w) in terms.iter().zip(&weights) {
             let want = TiePoint::measured(*normal, *want);
             let axes = normal.map_or_else(|| Vector2::repeat(1.0), |n| n.component_mul(&n));
@@ -118,6 +114,7 @@ pub(super) fn solve(
 
 /// Sets `out` to the product of the matrix of damping and smoothness with the displacements `x` of a grid, row-major.
 fn smooth(x: &[Vector2<f64>], columns: usize, damping: f64, out: &mut [Vector2<f64>]) {
+    let rows = x.len() / columns;
     for (i, (row, out)) in x.chunks_exact(columns).zip(out.chunks_exact_mut(columns)).enumerate() {
         for (out, v) in out.iter_mut().zip(row) {
             *out = v * damping;
@@ -128,13 +125,20 @@ fn smooth(x: &[Vector2<f64>], columns: usize, damping: f64, out: &mut [Vector2<f
         for k in 1..columns {
             out[k - 1] += (row[k - 1] - row[k]) * SMOOTHNESS;
         }
-        let above = i.checked_sub(1).map(|i| &x[i * columns..]);
-        for other in above.into_iter().chain(x.get((i + 1) * columns..).filter(|below| !below.is_empty())) {
+        let others = [i.checked_sub(1), (i + 1 < rows).then_some(i + 1)];
+        for other in others.into_iter().flatten().map(|other| &x[other * columns..]) {
             for ((out, v), w) in out.iter_mut().zip(row).zip(other) {
                 *out += (v - w) * SMOOTHNESS;
             }
         }
     }
+}
+
+/// Returns the diagonal of that matrix.
+fn smooth_diagonal(columns: usize, rows: usize, damping: f64) -> impl Iterator<Item = f64> {
+    let neighbors = |i: usize, n: usize| usize::from(i > 0) + usize::from(i + 1 < n);
+    let vertices = (0..rows).flat_map(move |y| (0..columns).map(move |x| (x, y)));
+    vertices.map(move |(x, y)| damping + SMOOTHNESS * (neighbors(x, columns) + neighbors(y, rows)) as f64)
 }
 
 /// Solves by conjugate gradients with Jacobi preconditioner, starting from `x`; ends at a squared residual of `tolerance` relative to the right-hand side, since
@@ -191,6 +195,32 @@ mod tests {
     use super::*;
     use crate::testing::stage;
     use nalgebra::{DMatrix, DVector};
+
+    #[test]
+    fn the_matrix_of_a_grid_is_that_of_its_energy() {
+        let (columns, rows, damping) = (4, 3, 0.7);
+        let at = |i: usize| Vector2::new((i * i % 7) as f64, (i * 5 % 11) as f64);
+        let x: Vec<Vector2<f64>> = (0..columns * rows).map(at).collect();
+        let mut energy = damping * x.iter().map(Vector2::norm_squared).sum::<f64>();
+        for i in 0..x.len() {
+            if (i + 1) % columns > 0 {
+                energy += SMOOTHNESS * (x[i] - x[i + 1]).norm_squared();
+            }
+            if i + columns < x.len() {
+                energy += SMOOTHNESS * (x[i] - x[i + columns]).norm_squared();
+            }
+        }
+        let mut product = vec![Vector2::zeros(); x.len()];
+        smooth(&x, columns, damping, &mut product);
+        let quadratic: f64 = x.iter().zip(&product).map(|(x, p)| x.dot(p)).sum();
+        assert!((quadratic - energy).abs() < 1e-9 * energy, "{quadratic} {energy}");
+        for (i, diagonal) in smooth_diagonal(columns, rows, damping).enumerate() {
+            let mut unit = vec![Vector2::zeros(); x.len()];
+            unit[i].x = 1.0;
+            smooth(&unit, columns, damping, &mut product);
+            assert!((product[i].x - diagonal).abs() < 1e-12, "{i}");
+        }
+    }
 
     #[test]
     fn conjugate_gradients_converge_to_the_direct_solution() {
