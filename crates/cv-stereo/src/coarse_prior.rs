@@ -161,6 +161,34 @@ fn count_similar<S: Simd>(_: S, rows: [&[f32]; 3], similar: &mut [u8]) {
     }
 }
 
+/// The index of pixels whose disparity is not determined.
+const NONE: u16 = u16::MAX;
+
+/// Sets the indices of a row of pixels from a row of half resolution; the last column of an odd width uses the last coarse one.
+#[simd]
+fn set_indices<S: Simd>(_: S, coarse: &[f32], similar: &[u8], range: (i32, usize), indices: &mut [u16]) {
+    let (first, last) = (range.0 as f32 / 2.0, (range.1 - 1) as f32);
+    let (pairs, rest) = indices.as_chunks_mut::<2>();
+    for ((pair, &d), &similar) in pairs.iter_mut().zip(coarse).zip(similar) {
+        let index = 2.0 * (d - first) + 0.5;
+        // NaN compares false, and is determined nowhere.
+        let index = if index < last { index } else { last };
+        let index = if index > 0.0 { index } else { 0.0 };
+        *pair = [if similar < MIN_SIMILAR { NONE } else { index as u16 }; 2];
+    }
+    if let (Some(one), Some(pair)) = (rest.first_mut(), pairs.last()) {
+        *one = pair[1];
+    }
+}
+
+/// Sets the [`Prior::index`] of a row of pixels, and removes the priors of those without one.
+#[simd]
+fn set_row<S: Simd>(_: S, indices: &[u16], priors: &mut [Prior]) {
+    for (&index, prior) in indices.iter().zip(priors) {
+        *prior = if index == NONE { Prior::default() } else { Prior::new(index, prior.cap()) };
+    }
+}
+
 /// Sets the [`Prior::index`] of pixels of low texture from a map of half resolution (NaN where unmatched), and removes the priors of pixels
 /// that it does not determine. `range` is the smallest disparity and the number of disparities.
 pub(crate) fn set_priors(
@@ -172,12 +200,11 @@ pub(crate) fn set_priors(
     priors: &mut [Prior],
 ) {
     let coarse_height = coarse.len() / coarse_width;
-    let last = range.1 as i32 - 1;
     priors.par_chunks_mut(2 * width).enumerate().for_each_init(
         || {
             (
                 vec![0u8; coarse_width],
-                vec![0u16; coarse_width],
+                vec![0u16; width],
                 [0; 3].map(|_| vec![f32::NAN; coarse_width + 2 * WINDOW_RADIUS]),
             )
         },
@@ -190,20 +217,12 @@ pub(crate) fn set_priors(
                 row[WINDOW_RADIUS..WINDOW_RADIUS + coarse_width]
                     .copy_from_slice(&coarse[y * coarse_width..][..coarse_width]);
             }
-            dispatch!(level, simd => count_similar(simd, [&*rows[0], &*rows[1], &*rows[2]], similar));
-            for ((index, &d), &similar) in indices.iter_mut().zip(here).zip(&*similar) {
-                let prior = ((2.0 * (d - range.0 as f32 / 2.0) + 0.5) as i32).clamp(0, last) as u16;
-                *index = if similar < MIN_SIMILAR { u16::MAX } else { prior };
-            }
-            for priors in priors.chunks_mut(width) {
-                // The last column of an odd width uses the last coarse one.
-                let columns = indices.iter().chain(indices.last());
-                for (&index, priors) in columns.zip(priors.chunks_mut(2)) {
-                    for prior in priors {
-                        *prior = if index == u16::MAX { Prior::default() } else { Prior::new(index, prior.cap()) };
-                    }
-                }
-            }
+            let rows = [&*rows[0], &*rows[1], &*rows[2]];
+            dispatch!(level, simd => {
+                count_similar(simd, rows, similar);
+                set_indices(simd, here, similar, range, indices);
+                priors.chunks_mut(width).for_each(|priors| set_row(simd, indices, priors));
+            });
         },
     );
 }

@@ -61,6 +61,14 @@ impl Frame<'_> {
         start..((column + 1 - columns.start as i64).clamp(0, n) as usize).max(start)
     }
 
+    /// Returns the columns, of these of the left image, whose correspondences at all indices are in those of the right image.
+    fn complete(&self, left: &Range<usize>, right: &Range<usize>) -> Range<usize> {
+        let last = self.min_disparity + self.disparities as i64 - 1;
+        let start = (right.start as i64 + last).max(left.start as i64);
+        let end = (right.end as i64 + self.min_disparity).min(left.end as i64);
+        if start < end { start as usize..end as usize } else { left.end..left.end }
+    }
+
     /// Returns whether the correspondence at index `k` is inside the right image and has data.
     pub(crate) fn has_match(&self, masks: &RowMasks<'_>, x: usize, k: usize) -> bool {
         let column = x as i64 - self.min_disparity - k as i64;
@@ -157,20 +165,18 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
     }
     let [left_columns, right_columns] = columns;
     // Only pixels near the ends of a row have correspondences outside the right image.
-    let inside = |x: usize| {
-        if left_columns.contains(&x) { frame.inside_columns(x, &right_columns) } else { 0..0 }
-    };
-    let all = |x: usize| inside(x).len() == frame.disparities;
-    let (first, last) = (xs.start, xs.end);
-    let border = |x: &usize| !all(*x);
-    let left = xs.clone().take_while(border).count();
-    let right = (first + left..last).rev().take_while(border).count();
+    let complete = frame.complete(&left_columns, &right_columns);
+    let start = complete.start.clamp(xs.start, xs.end);
+    let end = complete.end.clamp(start, xs.end);
     let out = &mut out[..count * groups * group];
-    let (out_left, rest) = out.split_at_mut(left * groups * group);
-    let (middle, out_right) = rest.split_at_mut((count - left - right) * groups * group);
-    let ends = [(first..first + left, out_left), (last - right..last, out_right)];
-    for (x, out) in ends.into_iter().flat_map(|(xs, out)| xs.zip(out.chunks_exact_mut(groups * group))) {
-        set_border_costs::<S, BLOCKS>(simd, frame, inside(x), !left_columns.contains(&x), out);
+    let (out_left, rest) = out.split_at_mut((start - xs.start) * groups * group);
+    let (middle, out_right) = rest.split_at_mut((end - start) * groups * group);
+    for (xs, out) in [(xs.start..start, out_left), (end..xs.end, out_right)] {
+        for (x, out) in xs.zip(out.chunks_exact_mut(groups * group)) {
+            let has_data = left_columns.contains(&x);
+            let inside = if has_data { frame.inside_columns(x, &right_columns) } else { 0..0 };
+            set_border_costs::<S, BLOCKS>(simd, frame, inside, !has_data, out);
+        }
     }
     if frame.disparities < groups * group {
         // Not `for_each`, which is not compiled for the instruction set: its SIMD operations would be function calls.
@@ -308,11 +314,15 @@ fn between<S: Simd>(simd: S, penalties: &Penalties, a: &[u8], b: &[u8], out: &mu
     let lanes = S::u8s::LEN;
     let whole = out.len() - out.len() % lanes;
     let one = S::u8s::splat(simd, 1);
+    // Two vectors of the table are looked up; beyond them few steps remain.
+    let near: [S::u8s; 2] = std::array::from_fn(|i| S::u8s::from_slice(simd, &penalties.table[i * lanes..][..lanes]));
+    let reach = (2 * lanes - 1) as u8;
+    let far = &penalties.steps[penalties.steps.partition_point(|&step| step <= reach)..];
     for at in (0..whole).step_by(lanes) {
         let (a, b) = (S::u8s::from_slice(simd, &a[at..][..lanes]), S::u8s::from_slice(simd, &b[at..][..lanes]));
         let difference = a.max(b) - a.min(b);
-        let mut p2 = S::u8s::splat(simd, penalties.table[0]);
-        for &step in &penalties.steps {
+        let mut p2 = near[0].concat_swizzle_dyn(near[1], difference.min(S::u8s::splat(simd, reach)));
+        for &step in far {
             p2 = difference.simd_ge(S::u8s::splat(simd, step)).select(p2 - one, p2);
         }
         p2.store_slice(&mut out[at..][..lanes]);

@@ -11,7 +11,7 @@ use crate::winner::Winner;
 // Set with the constants of `surfaces`; half and twice of each differ by 0.1 points of the errors above 2 px.
 /// Costs of out-of-view and of occluded pixels. A visible one costs 0 to 1.
 const OUT_OF_VIEW_COST: f32 = 0.45;
-pub(crate) const OCCLUDED_COST: f32 = 0.4;
+const OCCLUDED_COST: f32 = 0.4;
 /// Cost of a pixel that would occlude a match of the right image, and the difference in px from which it is in front.
 const OCCLUDING_COST: f32 = 2.0;
 const OCCLUSION_STEP: f32 = 1.5;
@@ -69,6 +69,14 @@ impl RightColumns {
         let element = usize::try_from(self.first - column as i64).ok().filter(|&element| element < self.row)?;
         Some((element & ((1 << self.phases) - 1)) * planes * self.phase + (element >> self.phases))
     }
+
+    /// Returns the census bits of a pixel, whose bytes are `stride` apart.
+    #[inline(always)]
+    fn bits(&self, bytes: &[u8], stride: usize) -> u64 {
+        let at = |bits: u64, p: usize| bits << 8 | u64::from(bytes[p * stride]);
+        // Unrolled for the default window.
+        if self.bytes == 3 { (0..3).fold(0, at) } else { (0..self.bytes).fold(0, at) }
+    }
 }
 
 /// The pair with its matches.
@@ -86,37 +94,19 @@ impl View<'_> {
         self.disparity.len() / self.pair.width
     }
 
-    /// Returns the census bits of a pixel of the left image.
+    /// Returns a row of pixels.
     #[inline(always)]
-    pub(crate) fn bits(&self, x: usize, y: usize) -> u64 {
+    pub(crate) fn row(&self, y: usize) -> Row<'_> {
         let Pair { width, planes, described, .. } = self.pair;
-        let first = &described[0][y * planes * width + x..];
-        (0..self.columns.bytes).fold(0, |bits, p| bits << 8 | u64::from(first[p * width]))
-    }
-
-    /// Returns the data term of a pixel with these census bits at a disparity; `texture` is the weight of the dissimilarity, 0 to 1.
-    #[inline(always)]
-    pub(crate) fn cost(&self, x: usize, y: usize, d: f32, texture: f32, bits: u64) -> f32 {
-        let Pair { width, planes, described, .. } = self.pair;
-        let column = x as f32 - d + 0.5;
-        if !(column >= 0.0 && column < width as f32) {
-            return OUT_OF_VIEW_COST;
+        let stride = planes * self.columns.row;
+        Row {
+            columns: self.columns,
+            planes,
+            chance: CHANCE_BITS * self.pair.bits as f32,
+            left: &described[0][y * planes * width..][..planes * width],
+            right: &described[1][y * stride..][..stride],
+            visible: &self.right[y * width..][..width],
         }
-        let column = column as usize;
-        let visible = self.right[y * width + column];
-        // −∞: no match there.
-        if visible.is_finite() && d > visible + OCCLUSION_STEP {
-            return OCCLUDING_COST;
-        }
-        if d < visible - 1.0 {
-            return if visible == f32::INFINITY { OUT_OF_VIEW_COST } else { OCCLUDED_COST };
-        }
-        let RightColumns { bytes, row, phase, .. } = self.columns;
-        let Some(place) = self.columns.place(column, planes) else { return OUT_OF_VIEW_COST };
-        let first = &described[1][y * planes * row + place..];
-        let there = (0..bytes).fold(0, |bits, p| bits << 8 | u64::from(first[p * phase]));
-        let chance = CHANCE_BITS * self.pair.bits as f32;
-        0.5 + texture * (((bits ^ there).count_ones() as f32 / chance).min(1.0) - 0.5)
     }
 
     /// Returns the plane of a surface in a cell: the local one where it is out of view or occluded.
@@ -147,6 +137,7 @@ impl View<'_> {
         let mut costs = [0.0; N];
         let (left, top) = (c % surfaces.columns * CELL, c / surfaces.columns * CELL);
         for y in (top + step / 2..(top + CELL).min(self.height())).step_by(step) {
+            let row = self.row(y);
             for x in (left + step / 2..(left + CELL).min(width)).step_by(step) {
                 let i = y * width + x;
                 let d = self.disparity[i];
@@ -159,11 +150,11 @@ impl View<'_> {
                     }
                     continue;
                 }
-                let bits = self.bits(x, y);
+                let bits = row.bits(x);
                 let has_match = !matches!(self.states[i], PixelState::OutOfView | PixelState::NoData);
                 let rejected = (self.pair.min_disparity + i32::from(self.pair.winners[i].index)) as f32;
                 for (cost, value) in costs.iter_mut().zip(values) {
-                    *cost += 0.25 * weight * OCCLUDING_COST * self.cost(x, y, value, texture, bits);
+                    *cost += 0.25 * weight * OCCLUDING_COST * row.cost(x, value, texture, bits);
                     if has_match {
                         *cost += weight * REJECTED_WEIGHT * (rejected - value).abs().min(2.0);
                     }
@@ -171,6 +162,51 @@ impl View<'_> {
             }
         }
         costs
+    }
+}
+
+/// A row of the pair, for the data terms of its pixels.
+#[derive(Clone, Copy)]
+pub(crate) struct Row<'a> {
+    columns: RightColumns,
+    planes: usize,
+    /// Number of differing census bits of a chance match.
+    chance: f32,
+    /// Census bits of both views.
+    left: &'a [u8],
+    right: &'a [u8],
+    /// The nearest match of each pixel of the right image: see [`View::right`].
+    visible: &'a [f32],
+}
+
+impl Row<'_> {
+    /// Returns the census bits of a pixel of the left image.
+    #[inline(always)]
+    pub(crate) fn bits(&self, x: usize) -> u64 {
+        self.columns.bits(&self.left[x..], self.visible.len())
+    }
+
+    /// Returns the data term of a pixel with these census bits at a disparity; `texture` is the weight of the dissimilarity, 0 to 1.
+    ///
+    /// Branch-free in view: whether a pixel is visible, occluded or occluding could not be predicted.
+    #[inline(always)]
+    pub(crate) fn cost(&self, x: usize, d: f32, texture: f32, bits: u64) -> f32 {
+        let column = x as f32 - d + 0.5;
+        if !(column >= 0.0 && column < self.visible.len() as f32) {
+            return OUT_OF_VIEW_COST;
+        }
+        let column = column as usize;
+        let visible = self.visible[column];
+        let place = self.columns.place(column, self.planes);
+        let there = self.columns.bits(&self.right[place.unwrap_or(0)..], self.columns.phase);
+        let chance = (bits ^ there).count_ones() as f32 / self.chance;
+        let cost = 0.5 + texture * (if chance < 1.0 { chance } else { 1.0 } - 0.5);
+        let cost = if place.is_some() { cost } else { OUT_OF_VIEW_COST };
+        let behind = if visible == f32::INFINITY { OUT_OF_VIEW_COST } else { OCCLUDED_COST };
+        let cost = if d < visible - 1.0 { behind } else { cost };
+        // −∞: no match there.
+        let is_occluding = visible.is_finite() & (d > visible + OCCLUSION_STEP);
+        if is_occluding { OCCLUDING_COST } else { cost }
     }
 }
 

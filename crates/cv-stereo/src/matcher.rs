@@ -411,7 +411,7 @@ impl StereoMatcher {
             let range = (first, first + (options.disparities - 1) as f32);
             let gray = [&self.gray[0], &self.gray[1]];
             local_expansion::expand(self.level, gray, range, disparity, states, progress)?;
-            surface_filling::classify_unmatched(disparity, states, width, masks, &mut self.filling);
+            surface_filling::classify_unmatched(self.level, disparity, states, width, masks, &mut self.filling);
         }
         self.borders.clear(disparity, states);
         if options.quality && !options.fill {

@@ -7,7 +7,7 @@
 
 use crate::PixelState;
 use crate::border_mask::PairMasks;
-use crate::fill_cost::{OCCLUDED_COST, Pair, RightColumns, View, texture_weight, unmatched_state};
+use crate::fill_cost::{Pair, RightColumns, View, texture_weight, unmatched_state};
 use crate::fill_uncertainty::Extrapolation;
 use crate::surfaces::{CELL, NONE, Surfaces, center, extent, neighbors};
 use cv_core::{Cancelled, Stage};
@@ -35,6 +35,8 @@ const PASSES: usize = 2;
 const MAX_GRAY_DIFFERENCE: f32 = 32.0;
 /// Weight of the data term relative to that difference.
 const DATA_WEIGHT: f32 = 2.0;
+/// Number of values in the largest vector.
+const MAX_LANES: usize = 16;
 /// Distance in px below which two planes are the same over a cell.
 const SAME_PLANE: f32 = 0.5;
 
@@ -75,7 +77,7 @@ pub(crate) fn fill(
     if surfaces.planes.is_empty() {
         return Ok(());
     }
-    project_matches(disparity, states, width, pair.masks, right);
+    project_matches(level, disparity, states, width, pair.masks, right);
     surfaces.smooth_low_texture(disparity, width);
     stage.check()?;
     surfaces.add_local_planes();
@@ -141,13 +143,14 @@ impl Filling {
 
 /// Sets the states of unmatched pixels by their current disparities.
 pub(crate) fn classify_unmatched(
+    level: Level,
     disparity: &[f32],
     states: &mut [PixelState],
     width: usize,
     masks: PairMasks<'_>,
     filling: &mut Filling,
 ) {
-    project_matches(disparity, states, width, masks, &mut filling.right);
+    project_matches(level, disparity, states, width, masks, &mut filling.right);
     let rows = disparity.par_chunks(width).zip(filling.right.par_chunks(width));
     states.par_chunks_mut(width).zip(rows).for_each(|(states, (disparity, right))| {
         for (x, (state, d)) in states.iter_mut().zip(disparity).enumerate() {
@@ -159,21 +162,45 @@ pub(crate) fn classify_unmatched(
 }
 
 /// Projects the matches to the right image: the nearest at each pixel.
-fn project_matches(disparity: &[f32], states: &[PixelState], width: usize, masks: PairMasks<'_>, right: &mut Vec<f32>) {
+fn project_matches(
+    level: Level,
+    disparity: &[f32],
+    states: &[PixelState],
+    width: usize,
+    masks: PairMasks<'_>,
+    right: &mut Vec<f32>,
+) {
     right.resize(disparity.len(), f32::NEG_INFINITY);
     let rows = disparity.par_chunks(width).zip(states.par_chunks(width));
-    right.par_chunks_mut(width).zip(rows).enumerate().for_each(|(y, (right, (disparity, states)))| {
-        right.fill(f32::NEG_INFINITY);
-        for (x, (&d, &state)) in disparity.iter().zip(states).enumerate() {
-            // Rounded to the nearest column. NaN compares false.
-            let column = x as f32 - d + 0.5;
-            if state == PixelState::Matched && column >= 0.0 && column < width as f32 {
-                let nearest = &mut right[column as usize];
-                *nearest = if d > *nearest { d } else { *nearest };
-            }
+    right.par_chunks_mut(width).zip(rows).enumerate().for_each_init(
+        || (vec![0f32; width.next_multiple_of(MAX_LANES)], vec![0f32; width + 1]),
+        |(columns, nearest), (y, (right, (disparity, states)))| {
+            dispatch!(level, simd => project_row(simd, disparity, states, columns, nearest));
+            right.copy_from_slice(&nearest[..width]);
+            masks.row(y).iter().for_each(|masks| masks.fill_right(right, f32::INFINITY));
+        },
+    );
+}
+
+/// Projects the matches of a row; `columns` is scratch, and the last element of `nearest` is that of all other pixels.
+#[simd]
+fn project_row<S: Simd>(simd: S, disparity: &[f32], states: &[PixelState], columns: &mut [f32], nearest: &mut [f32]) {
+    let width = disparity.len();
+    for (x, (column, (&d, &state))) in columns.iter_mut().zip(disparity.iter().zip(states)).enumerate() {
+        // Rounded to the nearest column. NaN compares false.
+        let at = x as i32 as f32 - d + 0.5;
+        let is_inside = (state == PixelState::Matched) & (at >= 0.0) & (at < width as f32);
+        *column = if is_inside { at } else { width as f32 };
+    }
+    nearest.fill(f32::NEG_INFINITY);
+    let lanes = S::f32s::LEN;
+    for (columns, disparity) in columns.chunks_exact(lanes).zip(disparity.chunks(lanes)) {
+        let columns = S::f32s::from_slice(simd, columns).to_int::<S::u32s>();
+        for (&column, &d) in columns.as_slice().iter().zip(disparity) {
+            let nearest = &mut nearest[column as usize];
+            *nearest = if d > *nearest { d } else { *nearest };
         }
-        masks.row(y).iter().for_each(|masks| masks.fill_right(right, f32::INFINITY));
-    });
+    }
 }
 
 /// Assigns every cell without a surface that of the cell at the shortest geodesic distance (Dijkstra's algorithm).
@@ -275,8 +302,9 @@ fn update_label(surfaces: &mut Surfaces, view: View<'_>, c: usize) -> bool {
 /// Returns the disparities of the holes of a row of cells, cell by cell.
 #[simd]
 fn fill_row<S: Simd>(_: S, surfaces: &Surfaces, view: View<'_>, row: usize) -> Vec<f32> {
-    let mut values = Vec::new();
-    for c in row * surfaces.columns..(row + 1) * surfaces.columns {
+    let cells = row * surfaces.columns..(row + 1) * surfaces.columns;
+    let mut values = Vec::with_capacity(surfaces.cells[cells.clone()].iter().map(|cell| cell.holes as usize).sum());
+    for c in cells {
         fill_cell(surfaces, view, c, &mut values);
     }
     values
@@ -309,9 +337,9 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
     }
     if let (1, Some(plane)) = (n, different[0]) {
         for y in ys {
-            for (x, d) in xs.clone().zip(&view.disparity[y * width..][xs.clone()]) {
+            for (value, d) in plane.row(xs.start, y).iter().zip(&view.disparity[y * width..][xs.clone()]) {
                 if d.is_nan() {
-                    out.push(plane.at(x as f64, y as f64));
+                    out.push(*value);
                 }
             }
         }
@@ -327,30 +355,37 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
             known += 1;
         }
     }
-    // Of a visible pixel without a differing census bit; surfaces that cannot be the best are skipped.
-    let least_cost = OCCLUDED_COST.min(0.5 - 0.5 * texture);
     for y in ys {
-        for x in xs.clone() {
-            if !view.disparity[y * width + x].is_nan() {
-                continue;
+        let holes = &view.disparity[y * width..][xs.clone()];
+        if holes.iter().all(|d| !d.is_nan()) {
+            continue;
+        }
+        let mut grays = [0f32; CELL];
+        for (gray, &value) in grays.iter_mut().zip(&view.pair.gray[y * width..][xs.clone()]) {
+            *gray = f32::from(value);
+        }
+        let mut differences = [[MAX_GRAY_DIFFERENCE; CELL]; 9];
+        for &(of_cell, place) in &cells[..known] {
+            for (least, gray) in differences[place].iter_mut().zip(grays) {
+                let difference = (gray - of_cell).abs();
+                *least = if difference < *least { difference } else { *least };
             }
-            let (gray, bits) = (f32::from(view.pair.gray[y * width + x]), view.bits(x, y));
-            let mut gray_difference = [MAX_GRAY_DIFFERENCE; 9];
-            for &(of_cell, place) in &cells[..known] {
-                gray_difference[place] = gray_difference[place].min((gray - of_cell).abs());
-            }
+        }
+        let mut values = [[0f32; CELL]; 9];
+        for (values, plane) in values.iter_mut().zip(different.iter().flatten()) {
+            *values = plane.row(xs.start, y);
+        }
+        let row = view.row(y);
+        for (i, _) in holes.iter().enumerate().filter(|(_, d)| d.is_nan()) {
+            let x = xs.start + i;
+            let bits = row.bits(x);
             let mut best = (f32::INFINITY, f32::NAN);
-            for (plane, difference) in different.iter().flatten().zip(gray_difference) {
-                let so_far = difference / MAX_GRAY_DIFFERENCE;
-                if so_far + DATA_WEIGHT * least_cost > best.0 {
-                    continue;
-                }
-                let d = plane.at(x as f64, y as f64);
-                let cost = so_far + DATA_WEIGHT * view.cost(x, y, d, texture, bits);
+            for (values, differences) in values[..n].iter().zip(&differences) {
+                let d = values[i];
+                let cost = differences[i] / MAX_GRAY_DIFFERENCE + DATA_WEIGHT * row.cost(x, d, texture, bits);
                 // Of equal costs the farther one.
-                if cost < best.0 || (cost == best.0 && d < best.1) {
-                    best = (cost, d);
-                }
+                let is_better = (cost < best.0) | ((cost == best.0) & (d < best.1));
+                best = if is_better { (cost, d) } else { best };
             }
             out.push(best.1);
         }

@@ -79,26 +79,16 @@ impl Moments {
                 d2[x] += off * off;
             }
         }
-        let mut all = Self::default();
-        for i in 0..CELL {
-            let x = f64::from(i as f32 - middle);
-            let [n, y1, y2, d1, yd, d2] = [n[i], y1[i], y2[i], d1[i], yd[i], d2[i]].map(f64::from);
-            let low = if n > 0.0 { f64::from(low) } else { 0.0 };
-            let d = d1 + n * low;
-            all.join(&Self {
-                n,
-                x: x * n,
-                y: y1,
-                xx: x * x * n,
-                xy: x * y1,
-                yy: y2,
-                d,
-                xd: x * d,
-                yd: yd + y1 * low,
-                dd: d2 + 2.0 * low * d1 + n * low * low,
-            });
-        }
-        all
+        let [n, y, yy, d, yd, dd] = [n, y1, y2, d1, yd, d2].map(|sums| sums.map(f64::from));
+        let column = |i: usize| i as f64 - 0.5 * (CELL - 1) as f64;
+        let times_x = |sums: &[f64; CELL]| std::array::from_fn(|i| column(i) * sums[i]);
+        let (x, xy, xd) = (times_x(&n), times_x(&y), times_x(&d));
+        let xx = times_x(&x);
+        let [n, x, y, xx, xy, yy, d, xd, yd, dd] = [n, x, y, xx, xy, yy, d, xd, yd, dd].map(sum);
+        // Relative to 0 in place of the lowest disparity.
+        let low = if n > 0.0 { f64::from(low) } else { 0.0 };
+        let dd = dd + 2.0 * low * d + n * low * low;
+        Self { n, x, y, xx, xy, yy, d: d + n * low, xd: xd + x * low, yd: yd + y * low, dd }
     }
 
     /// Returns the moments relative to a point at `(-dx, -dy)` from the current one.
@@ -157,6 +147,14 @@ impl Moments {
     }
 }
 
+/// Adds in pairs, for vectors.
+#[inline(always)]
+fn sum(values: [f64; CELL]) -> f64 {
+    let fours: [f64; CELL / 2] = std::array::from_fn(|i| values[i] + values[i + CELL / 2]);
+    let twos: [f64; CELL / 4] = std::array::from_fn(|i| fours[i] + fours[i + CELL / 4]);
+    twos[0] + twos[1]
+}
+
 /// Statistics of a cell.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Cell {
@@ -186,6 +184,19 @@ impl Plane {
     pub(crate) fn at(&self, x: f64, y: f64) -> f32 {
         let [a, b, c] = self.coefficients;
         (a * (x - self.origin.0) + b * (y - self.origin.1) + c).clamp(self.range.0, self.range.1) as f32
+    }
+
+    /// Returns the disparities of the pixels of a cell in row `y`, from column `x` on.
+    #[inline(always)]
+    pub(crate) fn row(&self, x: usize, y: usize) -> [f32; CELL] {
+        let [a, b, c] = self.coefficients;
+        let (low, high) = self.range;
+        std::array::from_fn(|i| {
+            let d = a * (x as f64 + i as f64 - self.origin.0) + b * (y as f64 - self.origin.1) + c;
+            // Vectorized, unlike `clamp`.
+            let d = if d < low { low } else { d };
+            (if d > high { high } else { d }) as f32
+        })
     }
 }
 

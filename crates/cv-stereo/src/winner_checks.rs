@@ -20,45 +20,73 @@ pub(crate) fn check_row<S: Simd>(
 ) {
     let chunks = states.chunks_mut(CHUNK).zip(disparities.chunks_mut(CHUNK));
     for (chunk, (winners, (states, disparities))) in winners.chunks(CHUNK).zip(chunks).enumerate() {
-        let [mut index, mut cost, mut below, mut above] = [[0f32; CHUNK]; 4];
-        let mut is_matched = [0f32; CHUNK];
-        for (i, (winner, state)) in winners.iter().zip(states).enumerate() {
-            *state = classify_winner(options, chunk * CHUNK + i, winner, right);
-            is_matched[i] = f32::from(u8::from(*state == PixelState::Matched));
-            index[i] = f32::from(winner.index);
-            cost[i] = f32::from(winner.cost);
-            below[i] = f32::from(winner.below);
-            above[i] = f32::from(winner.above);
-        }
+        let winners = Winners::new(options, winners, chunk * CHUNK, right);
+        let chunk_states = winners.classify(options);
+        states.copy_from_slice(&chunk_states[..states.len()]);
         let first = options.min_disparity as f32;
         for (i, d) in disparities.iter_mut().enumerate() {
             // Computed in any case: a branch would be mispredicted where matched and rejected pixels mix.
-            let value = first + index[i] + subpixel_offset(options.subpixel, [below[i], above[i], cost[i]]);
-            *d = if is_matched[i] > 0.0 { value } else { f32::NAN };
+            let sums = [winners.below[i], winners.above[i], winners.cost[i]].map(f32::from);
+            let value = first + f32::from(winners.index[i]) + subpixel_offset(options.subpixel, sums);
+            *d = if chunk_states[i] == PixelState::Matched { value } else { f32::NAN };
         }
     }
 }
 
-/// Classifies a pixel by its winner. Branch-free on pixel data, which would be mispredicted where matched and rejected pixels mix.
-#[inline(always)]
-fn classify_winner(options: &StereoOptions, x: usize, winner: &Winner, right: &[u16]) -> PixelState {
-    let xr = x as i64 - i64::from(options.min_disparity) - i64::from(winner.index);
-    let inside = xr >= 0 && xr < right.len() as i64;
-    let right_index = right[xr.clamp(0, right.len() as i64 - 1) as usize];
-    let differs = options.left_right.is_some_and(|tolerance| right_index.abs_diff(winner.index) > tolerance);
-    // A flat minimum determines neither the disparity nor the cause of a rejection.
-    let flat = winner.below == winner.cost;
-    let ambiguous = u32::from(winner.second) * u32::from(100 - options.uniqueness) < u32::from(winner.cost) * 100;
-    let ambiguous = flat | (ambiguous & (options.uniqueness > 0));
-    let mut state = if ambiguous { PixelState::Mismatched } else { PixelState::Matched };
-    // The surface in the right image is nearer: it occludes this pixel.
-    let inconsistent = if right_index > winner.index { PixelState::Occluded } else { PixelState::Mismatched };
-    state = if differs { inconsistent } else { state };
-    state = if inside { state } else { PixelState::OutOfView };
-    if flat { PixelState::Mismatched } else { state }
+/// The winners of neighboring pixels by member, for vectors.
+struct Winners {
+    index: [u16; CHUNK],
+    cost: [u16; CHUNK],
+    second: [u16; CHUNK],
+    below: [u16; CHUNK],
+    above: [u16; CHUNK],
+    /// Winning index of the correspondence; [`Winners::OUTSIDE`] outside the right image.
+    there: [u16; CHUNK],
 }
 
-/// Returns the offset of the minimum from the winning index, −0.5 to 0.5. Branch-free on the sums, as [`classify_winner`].
+impl Winners {
+    /// Larger than every index.
+    const OUTSIDE: u16 = u16::MAX;
+
+    /// Collects the winners of the pixels from column `x` on.
+    #[inline(always)]
+    fn new(options: &StereoOptions, winners: &[Winner], x: usize, right: &[u16]) -> Self {
+        let [index, cost, second, below, above, there] = [[0; CHUNK]; 6];
+        let mut all = Self { index, cost, second, below, above, there };
+        let first = x as i64 - i64::from(options.min_disparity);
+        for (i, winner) in winners.iter().enumerate() {
+            let Winner { index, cost, second, below, above } = *winner;
+            // Negative columns are large ones.
+            let column = (first + i as i64 - i64::from(index)) as usize;
+            all.there[i] = right.get(column).copied().unwrap_or(Self::OUTSIDE);
+            (all.index[i], all.cost[i], all.second[i], all.below[i], all.above[i]) =
+                (index, cost, second, below, above);
+        }
+        all
+    }
+
+    /// Classifies the pixels. Branch-free on pixel data, for vectors.
+    #[inline(always)]
+    fn classify(&self, options: &StereoOptions) -> [PixelState; CHUNK] {
+        let tolerance = options.left_right.unwrap_or(u16::MAX);
+        // Sums are at most 510 and uniqueness 99 %: their products fit.
+        let uniqueness = u16::from(options.uniqueness);
+        std::array::from_fn(|i| {
+            let (index, there, cost) = (self.index[i], self.there[i], self.cost[i]);
+            // A flat minimum determines neither the disparity nor the cause of a rejection.
+            let flat = self.below[i] == cost;
+            let ambiguous = (uniqueness > 0) & (self.second[i] * (100 - uniqueness) < cost * 100);
+            let mut state = if ambiguous { PixelState::Mismatched } else { PixelState::Matched };
+            // The surface in the right image is nearer: it occludes this pixel.
+            let inconsistent = if there > index { PixelState::Occluded } else { PixelState::Mismatched };
+            state = if there.abs_diff(index) > tolerance { inconsistent } else { state };
+            state = if there == Self::OUTSIDE { PixelState::OutOfView } else { state };
+            if flat { PixelState::Mismatched } else { state }
+        })
+    }
+}
+
+/// Returns the offset of the minimum from the winning index, −0.5 to 0.5. Branch-free on the sums, as [`Winners::classify`].
 #[inline(always)]
 fn subpixel_offset(method: Subpixel, [below, above, cost]: [f32; 3]) -> f32 {
     let no_sum = f32::from(NO_SUM);
