@@ -3,6 +3,7 @@
 use crate::StereoOptions;
 use crate::border_mask::{PairMasks, RowMasks};
 use crate::coarse_prior::{PRIOR_CENTER, PRIOR_COSTS, PRIOR_DISTANCES, PRIOR_MARGIN, Prior};
+use crate::kernel::TILE;
 use crate::layout::{BLOCK, Layout, place};
 use crate::winner::outside_cost;
 use fearless_simd::prelude::*;
@@ -101,45 +102,13 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
     xs: Range<usize>,
     out: &mut [u8],
 ) {
-    let lanes = S::u8s::LEN;
     let group = BLOCKS * BLOCK;
-    let n = group / lanes;
     let groups = frame.layout.groups();
-    let (width, planes) = (frame.width, frame.planes);
-    let (count, phase) = (xs.len(), frame.layout.phase(width));
-    let left = &frame.left[y * width * planes..][..width * planes];
-    let row = &frame.right[y * planes * n * phase..][..planes * n * phase];
+    let (width, count) = (frame.width, xs.len());
     let out = &mut out[..count * groups * group];
-    let here = |p: usize| &left[p * width + xs.start..][..count];
-    let described: [&[u8]; BITS] = std::array::from_fn(here);
-    // Pixels `n` apart have their candidates in the same phases, one element further: one vector of all of them at a time, so that the loop
-    // reads few slices.
-    for class in 0..n.min(count) {
-        let steps = (count - class).div_ceil(n);
-        for v in 0..n {
-            let start = width - xs.end + class + v;
-            let (of, first) = (start % n, start / n);
-            for g in 0..groups {
-                let to = (g * n + v) * lanes;
-                let candidates = |p: usize| &row[(of * planes + p) * phase + first + g * lanes..][..steps - 1 + lanes];
-                let bits: [&[u8]; BITS] = std::array::from_fn(candidates);
-                let intensity = frame.intensity_cap.map(|cap| (S::u8s::splat(simd, cap), candidates(BITS), here(BITS)));
-                for step in 0..steps {
-                    let pixel = count - 1 - class - step * n;
-                    let mut cost = S::u8s::splat(simd, 0);
-                    for p in 0..BITS {
-                        let candidate = S::u8s::from_slice(simd, &bits[p][step..][..lanes]);
-                        cost += (candidate ^ S::u8s::splat(simd, described[p][pixel])).count_ones();
-                    }
-                    if let Some((cap, candidates, here)) = intensity {
-                        let candidate = S::u8s::from_slice(simd, &candidates[step..][..lanes]);
-                        let value = S::u8s::splat(simd, here[pixel]);
-                        cost += (value.max(candidate) - value.min(candidate)).min(cap);
-                    }
-                    cost.store_slice(&mut out[pixel * groups * group + to..][..lanes]);
-                }
-            }
-        }
+    for (tile, out) in out.chunks_mut(TILE * groups * group).enumerate() {
+        let start = xs.start + tile * TILE;
+        match_tile::<S, BITS, BLOCKS>(simd, frame, y, start..(start + TILE).min(xs.end), out);
     }
     if let Some(priors) = frame.priors.get(y * width..(y + 1) * width) {
         for (prior, out) in priors[xs.clone()].iter().zip(out.chunks_exact_mut(groups * group)) {
@@ -182,6 +151,63 @@ fn costs<S: Simd, const BITS: usize, const BLOCKS: usize>(
         // Not `for_each`, which is not compiled for the instruction set: its SIMD operations would be function calls.
         for out in middle.chunks_exact_mut(groups * group) {
             pad::<S, BLOCKS>(simd, frame.disparities, out);
+        }
+    }
+}
+
+/// Computes the costs of at most [`TILE`] pixels at every disparity, as if all correspondences were inside the right image.
+#[inline(always)]
+fn match_tile<S: Simd, const BITS: usize, const BLOCKS: usize>(
+    simd: S,
+    frame: &Frame<'_>,
+    y: usize,
+    xs: Range<usize>,
+    out: &mut [u8],
+) {
+    let lanes = S::u8s::LEN;
+    let group = BLOCKS * BLOCK;
+    let n = group / lanes;
+    let groups = frame.layout.groups();
+    let (width, planes) = (frame.width, frame.planes);
+    let (count, phase) = (xs.len(), frame.layout.phase(width));
+    let left = &frame.left[y * width * planes..][..width * planes];
+    let row = &frame.right[y * planes * n * phase..][..planes * n * phase];
+    let here = |p: usize| &left[p * width + xs.start..][..count];
+    // Four times in a word: broadcasting words is a load, broadcasting bytes also a permutation.
+    let mut described = [[0u32; TILE]; BITS];
+    for (p, words) in described.iter_mut().enumerate() {
+        for (word, &byte) in words.iter_mut().zip(here(p)) {
+            *word = u32::from(byte) * 0x0101_0101;
+        }
+    }
+    // Pixels `n` apart have their candidates in the same phases, one element further: one vector of all of them at a time, so that the loop
+    // reads few slices.
+    for class in 0..n.min(count) {
+        let steps = (count - class).div_ceil(n);
+        for v in 0..n {
+            let start = width - xs.end + class + v;
+            let (of, first) = (start % n, start / n);
+            for g in 0..groups {
+                let to = (g * n + v) * lanes;
+                let candidates = |p: usize| &row[(of * planes + p) * phase + first + g * lanes..][..steps - 1 + lanes];
+                let bits: [&[u8]; BITS] = std::array::from_fn(candidates);
+                let intensity = frame.intensity_cap.map(|cap| (S::u8s::splat(simd, cap), candidates(BITS), here(BITS)));
+                for step in 0..steps {
+                    let pixel = count - 1 - class - step * n;
+                    let mut cost = S::u8s::splat(simd, 0);
+                    for p in 0..BITS {
+                        let candidate = S::u8s::from_slice(simd, &bits[p][step..][..lanes]);
+                        let here = S::u32s::splat(simd, described[p][pixel]).bitcast::<S::u8s>();
+                        cost += (candidate ^ here).count_ones();
+                    }
+                    if let Some((cap, candidates, here)) = intensity {
+                        let candidate = S::u8s::from_slice(simd, &candidates[step..][..lanes]);
+                        let value = S::u8s::splat(simd, here[pixel]);
+                        cost += (value.max(candidate) - value.min(candidate)).min(cap);
+                    }
+                    cost.store_slice(&mut out[pixel * groups * group + to..][..lanes]);
+                }
+            }
         }
     }
 }

@@ -123,40 +123,44 @@ impl View<'_> {
         }
     }
 
-    /// Returns the data terms of planes in a cell, from every `step`-th pixel of every `step`-th row.
+    /// Returns the data terms of planes in a cell, from `N` pixels, `STEP` apart, of every `STEP`-th row.
     #[inline(always)]
-    pub(crate) fn cell_costs<const N: usize>(
+    pub(crate) fn cell_costs<const PLANES: usize, const N: usize, const STEP: usize>(
         &self,
         surfaces: &Surfaces,
         c: usize,
-        planes: &[Option<&Plane>; N],
-        step: usize,
-    ) -> [f32; N] {
+        planes: &[Option<&Plane>; PLANES],
+    ) -> [f32; PLANES] {
         let width = self.pair.width;
         let texture = texture_weight(surfaces, c);
-        let mut costs = [0.0; N];
-        let (left, top) = (c % surfaces.columns * CELL, c / surfaces.columns * CELL);
-        for y in (top + step / 2..(top + CELL).min(self.height())).step_by(step) {
+        // Of a sample: the number of pixels it represents.
+        let weight = (STEP * STEP) as f32;
+        let mut costs = [0.0; PLANES];
+        let (left, top) = (c % surfaces.columns * CELL + STEP / 2, c / surfaces.columns * CELL);
+        for y in (top + STEP / 2..(top + CELL).min(self.height())).step_by(STEP) {
             let row = self.row(y);
-            for x in (left + step / 2..(left + CELL).min(width)).step_by(step) {
-                let i = y * width + x;
-                let d = self.disparity[i];
-                // Weight of the sample: the number of pixels it represents.
-                let weight = (step * step) as f32;
-                let values = planes.iter().map_while(|plane| plane.map(|plane| plane.at(x as f64, y as f64)));
+            let (mut values, mut count) = ([[0f32; N]; PLANES], 0);
+            for plane in planes.iter().map_while(|plane| *plane) {
+                values[count] = plane.row::<N, STEP>(left, y);
+                count += 1;
+            }
+            let (costs, values) = (&mut costs[..count], &values[..count]);
+            for (i, x) in (left..width).step_by(STEP).take(N).enumerate() {
+                let at = y * width + x;
+                let d = self.disparity[at];
                 if !d.is_nan() {
-                    for (cost, value) in costs.iter_mut().zip(values) {
-                        *cost += weight * MATCH_WEIGHT * (d - value).abs().min(2.0);
+                    for (cost, values) in costs.iter_mut().zip(values) {
+                        *cost += weight * MATCH_WEIGHT * (d - values[i]).abs().min(2.0);
                     }
                     continue;
                 }
                 let bits = row.bits(x);
-                let has_match = !matches!(self.states[i], PixelState::OutOfView | PixelState::NoData);
-                let rejected = (self.pair.min_disparity + i32::from(self.pair.winners[i].index)) as f32;
-                for (cost, value) in costs.iter_mut().zip(values) {
-                    *cost += 0.25 * weight * OCCLUDING_COST * row.cost(x, value, texture, bits);
+                let has_match = !matches!(self.states[at], PixelState::OutOfView | PixelState::NoData);
+                let rejected = (self.pair.min_disparity + i32::from(self.pair.winners[at].index)) as f32;
+                for (cost, values) in costs.iter_mut().zip(values) {
+                    *cost += 0.25 * weight * OCCLUDING_COST * row.cost(x, values[i], texture, bits);
                     if has_match {
-                        *cost += weight * REJECTED_WEIGHT * (rejected - value).abs().min(2.0);
+                        *cost += weight * REJECTED_WEIGHT * (rejected - values[i]).abs().min(2.0);
                     }
                 }
             }

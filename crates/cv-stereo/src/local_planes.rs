@@ -66,7 +66,8 @@ mod tests {
         let disparity: Vec<f32> = (0..WIDTH * HEIGHT).map(disparity).collect();
         let gray: Vec<u8> = (0..WIDTH * HEIGHT).map(|i| 90 + (i % 2) as u8 * contrast).collect();
         let mut surfaces = Surfaces::default();
-        surfaces.segment(Level::new(), &disparity, &gray, WIDTH, 0.0);
+        surfaces.measure_cells(Level::new(), &disparity, &gray, WIDTH);
+        surfaces.segment(0.0);
         surfaces.add_local_planes();
         surfaces
     }

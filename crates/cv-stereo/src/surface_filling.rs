@@ -72,12 +72,17 @@ pub(crate) fn fill(
     let width = pair.width;
     let Filling { surfaces, right, open, is_stale, heap, extrapolations } = filling;
     extrapolations.clear();
-    surfaces.segment(level, disparity, pair.gray, width, pair.min_disparity as f32);
+    surfaces.measure_cells(level, disparity, pair.gray, width);
+    // Surfaces grow on one thread.
+    let (matches, of_matches) = (&*disparity, &*states);
+    rayon::join(
+        || surfaces.segment(pair.min_disparity as f32),
+        || project_matches(level, matches, of_matches, width, pair.masks, right),
+    );
     stage.check()?;
     if surfaces.planes.is_empty() {
         return Ok(());
     }
-    project_matches(level, disparity, states, width, pair.masks, right);
     surfaces.smooth_low_texture(disparity, width);
     stage.check()?;
     surfaces.add_local_planes();
@@ -220,7 +225,7 @@ fn propagate_labels(
         for n in neighbors(c, columns, rows).into_iter().flatten().filter(|&n| surfaces.labels[n] == NONE) {
             let plane = view.plane(surfaces, label, n);
             let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs() / EDGE_GRAY;
-            let [cost] = view.cell_costs(surfaces, n, &[Some(plane)], 4);
+            let [cost] = view.cell_costs::<1, 2, 4>(surfaces, n, &[Some(plane)]);
             let (x, y) = center(n, columns);
             let is_out_of_view = x < f64::from(plane.at(x, y));
             let step = scales[label as usize][usize::from(is_out_of_view)] * (1.0 + edge + PATH_COST_WEIGHT * cost);
@@ -283,7 +288,7 @@ fn update_label(surfaces: &mut Surfaces, view: View<'_>, c: usize) -> bool {
         let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs();
         Some((view.plane(surfaces, surfaces.labels[n], n).at(x, y), SMOOTHNESS * EDGE_GRAY / (EDGE_GRAY + edge)))
     });
-    let costs = view.cell_costs(surfaces, c, &planes, 2);
+    let costs = view.cell_costs::<9, 4, 2>(surfaces, c, &planes);
     let mut best = (f32::INFINITY, surfaces.labels[c]);
     for ((plane, label), mut cost) in planes.iter().zip(labels).zip(costs) {
         let Some(plane) = plane else { break };
@@ -337,7 +342,7 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
     }
     if let (1, Some(plane)) = (n, different[0]) {
         for y in ys {
-            for (value, d) in plane.row(xs.start, y).iter().zip(&view.disparity[y * width..][xs.clone()]) {
+            for (value, d) in plane.row::<CELL, 1>(xs.start, y).iter().zip(&view.disparity[y * width..][xs.clone()]) {
                 if d.is_nan() {
                     out.push(*value);
                 }
@@ -373,7 +378,7 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
         }
         let mut values = [[0f32; CELL]; 9];
         for (values, plane) in values.iter_mut().zip(different.iter().flatten()) {
-            *values = plane.row(xs.start, y);
+            *values = plane.row::<CELL, 1>(xs.start, y);
         }
         let row = view.row(y);
         for (i, _) in holes.iter().enumerate().filter(|(_, d)| d.is_nan()) {

@@ -186,13 +186,13 @@ impl Plane {
         (a * (x - self.origin.0) + b * (y - self.origin.1) + c).clamp(self.range.0, self.range.1) as f32
     }
 
-    /// Returns the disparities of the pixels of a cell in row `y`, from column `x` on.
+    /// Returns the disparities of `N` pixels of row `y`, `STEP` apart from column `x` on.
     #[inline(always)]
-    pub(crate) fn row(&self, x: usize, y: usize) -> [f32; CELL] {
+    pub(crate) fn row<const N: usize, const STEP: usize>(&self, x: usize, y: usize) -> [f32; N] {
         let [a, b, c] = self.coefficients;
         let (low, high) = self.range;
         std::array::from_fn(|i| {
-            let d = a * (x as f64 + i as f64 - self.origin.0) + b * (y as f64 - self.origin.1) + c;
+            let d = a * (x as f64 + (i * STEP) as f64 - self.origin.0) + b * (y as f64 - self.origin.1) + c;
             // Vectorized, unlike `clamp`.
             let d = if d < low { low } else { d };
             (if d > high { high } else { d }) as f32
@@ -235,8 +235,8 @@ impl Surfaces {
         width.div_ceil(CELL).saturating_mul(height.div_ceil(CELL)).saturating_mul(cell)
     }
 
-    /// Segments a map (NaN where unknown) into surfaces. Linear in the number of pixels, except for sorting the cells.
-    pub(crate) fn segment(&mut self, level: Level, disparity: &[f32], gray: &[u8], width: usize, lowest: f32) {
+    /// Computes the statistics of the cells of a map (NaN where unknown).
+    pub(crate) fn measure_cells(&mut self, level: Level, disparity: &[f32], gray: &[u8], width: usize) {
         let height = disparity.len() / width;
         self.columns = width.div_ceil(CELL);
         self.cells.resize(self.columns * height.div_ceil(CELL), Cell::default());
@@ -244,6 +244,10 @@ impl Surfaces {
         self.cells.par_chunks_mut(columns).enumerate().for_each(|(row, cells)| {
             dispatch!(level, simd => compute_cells(simd, disparity, gray, (width, height), row, cells));
         });
+    }
+
+    /// Segments the cells into surfaces, of disparities from `lowest` on. O(c log c) for c cells.
+    pub(crate) fn segment(&mut self, lowest: f32) {
         self.grow(MIN_PIXELS, lowest);
         if self.planes.is_empty() {
             // Thin structures only.
@@ -506,7 +510,8 @@ mod tests {
     fn segmented(d: impl Fn(usize, usize) -> f32, gray: u8) -> (Surfaces, Vec<f32>) {
         let disparity: Vec<f32> = (0..WIDTH * HEIGHT).map(|i| d(i % WIDTH, i / WIDTH)).collect();
         let mut surfaces = Surfaces::default();
-        surfaces.segment(Level::new(), &disparity, &vec![gray; WIDTH * HEIGHT], WIDTH, 0.0);
+        surfaces.measure_cells(Level::new(), &disparity, &vec![gray; WIDTH * HEIGHT], WIDTH);
+        surfaces.segment(0.0);
         (surfaces, disparity)
     }
 
@@ -547,7 +552,8 @@ mod tests {
         let textured: Vec<u8> = (0..WIDTH * HEIGHT).map(|i| (i % 2 * 40) as u8).collect();
         let mut surfaces = Surfaces::default();
         let steps: Vec<f32> = (0..WIDTH * HEIGHT).map(|i| road(i / WIDTH).round()).collect();
-        surfaces.segment(Level::new(), &steps, &textured, WIDTH, 0.0);
+        surfaces.measure_cells(Level::new(), &steps, &textured, WIDTH);
+        surfaces.segment(0.0);
         let mut kept = steps.clone();
         surfaces.smooth_low_texture(&mut kept, WIDTH);
         assert_eq!(kept, steps);
