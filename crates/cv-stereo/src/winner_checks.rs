@@ -6,7 +6,7 @@ use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
 
 /// Pixels that are refined at a time, in vectors.
-const CHUNK: usize = 64;
+const CHUNK: usize = 256;
 
 /// Writes the states and disparities of a row. `right` has the winning indices of the row of the right view.
 #[simd]
