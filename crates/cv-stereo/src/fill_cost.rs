@@ -79,19 +79,25 @@ impl RightColumns {
     }
 }
 
-/// The pair with its matches.
+/// The pair with the matches of its right image.
 #[derive(Clone, Copy)]
 pub(crate) struct View<'a> {
     pub(crate) pair: Pair<'a>,
     pub(crate) columns: RightColumns,
+    /// Disparity of the nearest match of each pixel, −∞ without any, +∞ without data.
     pub(crate) right: &'a [f32],
+}
+
+/// The matches of the left image: disparities, NaN in holes, and states.
+#[derive(Clone, Copy)]
+pub(crate) struct Matches<'a> {
     pub(crate) disparity: &'a [f32],
     pub(crate) states: &'a [PixelState],
 }
 
 impl View<'_> {
     pub(crate) fn height(&self) -> usize {
-        self.disparity.len() / self.pair.width
+        self.right.len() / self.pair.width
     }
 
     /// Returns a row of pixels.
@@ -127,6 +133,7 @@ impl View<'_> {
     #[inline(always)]
     pub(crate) fn cell_costs<const PLANES: usize, const N: usize, const STEP: usize>(
         &self,
+        matches: Matches<'_>,
         surfaces: &Surfaces,
         c: usize,
         planes: &[Option<&Plane>; PLANES],
@@ -147,7 +154,7 @@ impl View<'_> {
             let (costs, values) = (&mut costs[..count], &values[..count]);
             for (i, x) in (left..width).step_by(STEP).take(N).enumerate() {
                 let at = y * width + x;
-                let d = self.disparity[at];
+                let d = matches.disparity[at];
                 if !d.is_nan() {
                     for (cost, values) in costs.iter_mut().zip(values) {
                         *cost += weight * MATCH_WEIGHT * (d - values[i]).abs().min(2.0);
@@ -155,7 +162,7 @@ impl View<'_> {
                     continue;
                 }
                 let bits = row.bits(x);
-                let has_match = !matches!(self.states[at], PixelState::OutOfView | PixelState::NoData);
+                let has_match = !matches!(matches.states[at], PixelState::OutOfView | PixelState::NoData);
                 let rejected = (self.pair.min_disparity + i32::from(self.pair.winners[at].index)) as f32;
                 for (cost, values) in costs.iter_mut().zip(values) {
                     *cost += 0.25 * weight * OCCLUDING_COST * row.cost(x, values[i], texture, bits);

@@ -7,7 +7,7 @@
 
 use crate::PixelState;
 use crate::border_mask::PairMasks;
-use crate::fill_cost::{Pair, RightColumns, View, texture_weight, unmatched_state};
+use crate::fill_cost::{Matches, Pair, RightColumns, View, texture_weight, unmatched_state};
 use crate::fill_uncertainty::Extrapolation;
 use crate::surfaces::{CELL, NONE, Surfaces, center, extent, neighbors};
 use cv_core::{Cancelled, Stage};
@@ -86,18 +86,19 @@ pub(crate) fn fill(
     surfaces.smooth_low_texture(disparity, width);
     stage.check()?;
     surfaces.add_local_planes();
-    let view = View { pair, right, disparity, states, columns: RightColumns::new(&pair) };
+    let view = View { pair, right, columns: RightColumns::new(&pair) };
+    let matches = Matches { disparity, states };
     open.clear();
     open.extend((0..surfaces.cells.len() as u32).filter(|&c| surfaces.labels[c as usize] == NONE));
     extrapolations.resize(surfaces.cells.len(), Extrapolation::default());
-    propagate_labels(surfaces, view, heap, extrapolations, stage)?;
+    propagate_labels(surfaces, view, matches, heap, extrapolations, stage)?;
     // Cells of which a neighbor changed since they were updated.
     is_stale.clear();
     is_stale.resize(surfaces.cells.len(), true);
     for pass in 0..PASSES {
         for i in 0..open.len() {
             let c = open[if pass % 2 == 0 { i } else { open.len() - 1 - i }] as usize;
-            if std::mem::take(&mut is_stale[c]) && update_label(surfaces, view, c) {
+            if std::mem::take(&mut is_stale[c]) && update_label(surfaces, view, matches, c) {
                 surfaces.around(c).for_each(|n| is_stale[n] = n != c);
             }
             if i.is_multiple_of(1024) {
@@ -108,32 +109,11 @@ pub(crate) fn fill(
     for &c in open.iter() {
         extrapolations[c as usize].ambiguity = surfaces.ambiguity(c as usize);
     }
-    let columns = surfaces.columns;
-    let filled: Vec<Vec<f32>> = (0..surfaces.cells.len().div_ceil(columns))
-        .into_par_iter()
-        .map(|row| dispatch!(level, simd => fill_row(simd, surfaces, view, row)))
-        .collect();
-    stage.check()?;
+    let surfaces = &*surfaces;
     let rows = disparity.par_chunks_mut(CELL * width).zip(states.par_chunks_mut(CELL * width));
-    rows.zip(right.par_chunks(CELL * width)).zip(filled).enumerate().for_each(
-        |(row, (((disparity, states), right), filled))| {
-            let mut filled = filled.into_iter();
-            let height = disparity.len() / width;
-            for x in (0..columns).filter(|x| surfaces.cells[row * columns + x].holes > 0) {
-                let (xs, ys) = extent(x, columns, (width, height));
-                for y in ys {
-                    for x in xs.clone() {
-                        let i = y * width + x;
-                        if disparity[i].is_nan() {
-                            let d = filled.next().unwrap_or(f32::NAN);
-                            disparity[i] = d;
-                            states[i] = unmatched_state(x, d, &right[y * width..][..width]);
-                        }
-                    }
-                }
-            }
-        },
-    );
+    rows.enumerate().for_each(|(row, (disparity, states))| {
+        dispatch!(level, simd => fill_row(simd, surfaces, view, row, (disparity, states)));
+    });
     Ok(())
 }
 
@@ -212,6 +192,7 @@ fn project_row<S: Simd>(simd: S, disparity: &[f32], states: &[PixelState], colum
 fn propagate_labels(
     surfaces: &mut Surfaces,
     view: View<'_>,
+    matches: Matches<'_>,
     heap: &mut BinaryHeap<Reverse<(u64, u32, u32)>>,
     extrapolations: &mut [Extrapolation],
     stage: &Stage<'_>,
@@ -225,7 +206,7 @@ fn propagate_labels(
         for n in neighbors(c, columns, rows).into_iter().flatten().filter(|&n| surfaces.labels[n] == NONE) {
             let plane = view.plane(surfaces, label, n);
             let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs() / EDGE_GRAY;
-            let [cost] = view.cell_costs::<1, 2, 4>(surfaces, n, &[Some(plane)]);
+            let [cost] = view.cell_costs::<1, 2, 4>(matches, surfaces, n, &[Some(plane)]);
             let (x, y) = center(n, columns);
             let is_out_of_view = x < f64::from(plane.at(x, y));
             let step = scales[label as usize][usize::from(is_out_of_view)] * (1.0 + edge + PATH_COST_WEIGHT * cost);
@@ -262,7 +243,7 @@ fn distance_scales(size: usize) -> [f32; 2] {
 }
 
 /// Assigns a cell the surface of its neighborhood of the lowest energy: data term and smoothness term. Returns whether it changes.
-fn update_label(surfaces: &mut Surfaces, view: View<'_>, c: usize) -> bool {
+fn update_label(surfaces: &mut Surfaces, view: View<'_>, matches: Matches<'_>, c: usize) -> bool {
     let (around, count) = surfaces.labels_around(c);
     // Surfaces of one plane are one.
     let (mut planes, mut labels, mut n) = ([None; 9], [NONE; 9], 0);
@@ -288,7 +269,7 @@ fn update_label(surfaces: &mut Surfaces, view: View<'_>, c: usize) -> bool {
         let edge = (surfaces.cells[c].gray - surfaces.cells[n].gray).abs();
         Some((view.plane(surfaces, surfaces.labels[n], n).at(x, y), SMOOTHNESS * EDGE_GRAY / (EDGE_GRAY + edge)))
     });
-    let costs = view.cell_costs::<9, 4, 2>(surfaces, c, &planes);
+    let costs = view.cell_costs::<9, 4, 2>(matches, surfaces, c, &planes);
     let mut best = (f32::INFINITY, surfaces.labels[c]);
     for ((plane, label), mut cost) in planes.iter().zip(labels).zip(costs) {
         let Some(plane) = plane else { break };
@@ -304,24 +285,25 @@ fn update_label(surfaces: &mut Surfaces, view: View<'_>, c: usize) -> bool {
     is_changed
 }
 
-/// Returns the disparities of the holes of a row of cells, cell by cell.
+/// Fills the holes of a row of cells: each pixel takes the surface of the neighboring cells of the lowest data term and difference in gray level.
 #[simd]
-fn fill_row<S: Simd>(_: S, surfaces: &Surfaces, view: View<'_>, row: usize) -> Vec<f32> {
-    let cells = row * surfaces.columns..(row + 1) * surfaces.columns;
-    let mut values = Vec::with_capacity(surfaces.cells[cells.clone()].iter().map(|cell| cell.holes as usize).sum());
-    for c in cells {
-        fill_cell(surfaces, view, c, &mut values);
+fn fill_row<S: Simd>(
+    _: S,
+    surfaces: &Surfaces,
+    view: View<'_>,
+    row: usize,
+    (disparity, states): (&mut [f32], &mut [PixelState]),
+) {
+    for c in row * surfaces.columns..(row + 1) * surfaces.columns {
+        if surfaces.cells[c].holes > 0 {
+            fill_cell(surfaces, view, c, (disparity, states));
+        }
     }
-    values
 }
 
-/// Appends the disparities of a cell's holes, in raster order: each pixel takes the surface of the neighboring cells of the lowest data term
-/// and difference in gray level.
+/// Fills the holes of a cell, given its row of cells.
 #[inline(always)]
-fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) {
-    if surfaces.cells[c].holes == 0 {
-        return;
-    }
+fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, (disparity, states): (&mut [f32], &mut [PixelState])) {
     let columns = surfaces.columns;
     let (width, height) = (view.pair.width, view.height());
     let (around, count) = surfaces.labels_around(c);
@@ -340,16 +322,6 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
             n += 1;
         }
     }
-    if let (1, Some(plane)) = (n, different[0]) {
-        for y in ys {
-            for (value, d) in plane.row::<CELL, 1>(xs.start, y).iter().zip(&view.disparity[y * width..][xs.clone()]) {
-                if d.is_nan() {
-                    out.push(*value);
-                }
-            }
-        }
-        return;
-    }
     let texture = texture_weight(surfaces, c);
     // Gray level and surface of the neighboring cells.
     let mut cells = [(0f32, 0usize); 9];
@@ -360,10 +332,15 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
             known += 1;
         }
     }
-    for y in ys {
-        let holes = &view.disparity[y * width..][xs.clone()];
+    for (line, y) in ys.enumerate() {
+        let first = line * width + xs.start;
+        let (holes, states) = (&mut disparity[first..][..xs.len()], &mut states[first..][..xs.len()]);
         if holes.iter().all(|d| !d.is_nan()) {
             continue;
+        }
+        let mut values = [[0f32; CELL]; 9];
+        for (values, plane) in values.iter_mut().zip(different.iter().flatten()) {
+            *values = plane.row::<CELL, 1>(xs.start, y);
         }
         let mut grays = [0f32; CELL];
         for (gray, &value) in grays.iter_mut().zip(&view.pair.gray[y * width..][xs.clone()]) {
@@ -376,23 +353,22 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, out: &mut Vec<f32>) 
                 *least = if difference < *least { difference } else { *least };
             }
         }
-        let mut values = [[0f32; CELL]; 9];
-        for (values, plane) in values.iter_mut().zip(different.iter().flatten()) {
-            *values = plane.row::<CELL, 1>(xs.start, y);
-        }
-        let row = view.row(y);
-        for (i, _) in holes.iter().enumerate().filter(|(_, d)| d.is_nan()) {
+        let (row, visible) = (view.row(y), &view.right[y * width..][..width]);
+        for (i, (hole, state)) in holes.iter_mut().zip(states).enumerate().filter(|(_, (d, _))| d.is_nan()) {
             let x = xs.start + i;
-            let bits = row.bits(x);
-            let mut best = (f32::INFINITY, f32::NAN);
-            for (values, differences) in values[..n].iter().zip(&differences) {
-                let d = values[i];
-                let cost = differences[i] / MAX_GRAY_DIFFERENCE + DATA_WEIGHT * row.cost(x, d, texture, bits);
-                // Of equal costs the farther one.
-                let is_better = (cost < best.0) | ((cost == best.0) & (d < best.1));
-                best = if is_better { (cost, d) } else { best };
+            let mut best = (f32::INFINITY, values[0][i]);
+            if n > 1 {
+                let bits = row.bits(x);
+                for (values, differences) in values[..n].iter().zip(&differences) {
+                    let d = values[i];
+                    let cost = differences[i] / MAX_GRAY_DIFFERENCE + DATA_WEIGHT * row.cost(x, d, texture, bits);
+                    // Of equal costs the farther one.
+                    let is_better = (cost < best.0) | ((cost == best.0) & (d < best.1));
+                    best = if is_better { (cost, d) } else { best };
+                }
             }
-            out.push(best.1);
+            *hole = best.1;
+            *state = unmatched_state(x, best.1, visible);
         }
     }
 }
