@@ -338,7 +338,7 @@ fn fill_cell(surfaces: &Surfaces, view: View<'_>, c: usize, (disparity, states):
         if holes.iter().all(|d| !d.is_nan()) {
             continue;
         }
-        let mut values = [[0f32; CELL]; 9];
+        let mut values = [[f32::NAN; CELL]; 9];
         for (values, plane) in values.iter_mut().zip(different.iter().flatten()) {
             *values = plane.row::<CELL, 1>(xs.start, y);
         }

@@ -558,4 +558,13 @@ mod tests {
         surfaces.smooth_low_texture(&mut kept, WIDTH);
         assert_eq!(kept, steps);
     }
+
+    #[test]
+    fn a_row_of_a_plane_has_its_disparities() {
+        let plane = Plane { origin: (3.5, 3.5), coefficients: [0.7, -1.3, 12.0], range: (10.0, 14.5) };
+        for y in 0..CELL {
+            let row = plane.row::<4, 2>(1, y);
+            assert_eq!(row, std::array::from_fn(|i| plane.at((1 + 2 * i) as f64, y as f64)), "{y}");
+        }
+    }
 }

@@ -101,3 +101,56 @@ fn subpixel_offset(method: Subpixel, [below, above, cost]: [f32; 3]) -> f32 {
     let none = (method == Subpixel::None) | (below == no_sum) | (above == no_sum) | (slope <= 0.0);
     if none { 0.0 } else { offset }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use fearless_simd::{Level, dispatch};
+    use proptest::prelude::*;
+
+    /// The checks of one pixel, one after the other.
+    fn expected(options: &StereoOptions, x: usize, winner: &Winner, right: &[u16]) -> PixelState {
+        let column = x as i64 - i64::from(options.min_disparity) - i64::from(winner.index);
+        let there = usize::try_from(column).ok().and_then(|column| right.get(column));
+        let ratio = f64::from(winner.second) * f64::from(100 - options.uniqueness);
+        match there {
+            _ if winner.below == winner.cost => PixelState::Mismatched,
+            None => PixelState::OutOfView,
+            Some(&there) if options.left_right.is_some_and(|tolerance| there.abs_diff(winner.index) > tolerance) => {
+                if there > winner.index {
+                    PixelState::Occluded
+                } else {
+                    PixelState::Mismatched
+                }
+            }
+            _ if options.uniqueness > 0 && ratio < 100.0 * f64::from(winner.cost) => PixelState::Mismatched,
+            _ => PixelState::Matched,
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn rows_are_checked_as_pixels_are(
+            pixels in proptest::collection::vec((0u16..40, 0u16..=NO_SUM, 0u16..=NO_SUM, 0u16..=NO_SUM, 0u16..40), 1..700),
+            min_disparity in -20i32..20,
+            uniqueness in prop_oneof![Just(0u8), 1u8..100],
+            left_right in proptest::option::of(0u16..4),
+        ) {
+            let options = StereoOptions { min_disparity, uniqueness, left_right, ..Default::default() };
+            let winner = |&(index, cost, second, below, _): &(u16, u16, u16, u16, u16)| {
+                Winner { index, cost, second, below: below.max(cost), above: NO_SUM }
+            };
+            let winners: Vec<Winner> = pixels.iter().map(winner).collect();
+            let right: Vec<u16> = pixels.iter().map(|pixel| pixel.4).collect();
+            let mut states = vec![PixelState::NoData; pixels.len()];
+            let mut disparities = vec![0.0; pixels.len()];
+            dispatch!(Level::new(), simd => check_row(simd, &options, &winners, &right, &mut states, &mut disparities));
+            for (x, (winner, (state, d))) in winners.iter().zip(states.iter().zip(&disparities)).enumerate() {
+                prop_assert_eq!(*state, expected(&options, x, winner, &right), "{} {:?}", x, winner);
+                // Without a sum above, there is no sub-pixel refinement.
+                let whole = (min_disparity + i32::from(winner.index)) as f32;
+                prop_assert!(if *state == PixelState::Matched { *d == whole } else { d.is_nan() }, "{x} {winner:?} {d}");
+            }
+        }
+    }
+}
