@@ -42,6 +42,7 @@ mod local_planes;
 mod matcher;
 mod matcher_memory;
 mod median;
+mod moments;
 mod options;
 mod path_sums;
 mod plane_cost;

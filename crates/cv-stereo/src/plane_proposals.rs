@@ -3,8 +3,8 @@
 
 use crate::PixelState;
 use crate::expansion_region::{Labels, Problem, Region, Scratch, pixels};
+use crate::moments::Moments;
 use crate::plane_cost::{Plane, Rectangle, at};
-use crate::surfaces::Moments;
 use cv_core::{Cancelled, Stage};
 
 /// Difference of disparities in px above which they are of different surfaces.

@@ -5,7 +5,7 @@ use crate::{PixelState, StereoOptions, Subpixel};
 use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
 
-/// Pixels that are refined at a time, in vectors.
+/// Pixels that are checked and refined at a time: so many that their members are stored long before vectors of them are loaded.
 const CHUNK: usize = 256;
 
 /// Writes the states and disparities of a row. `right` has the winning indices of the row of the right view.
