@@ -1,10 +1,10 @@
 //! The Sampson error of epipolar geometry, and refinement by minimizing it.
 
-use crate::match_blocks::{LANES, MatchBlock};
+use crate::match_blocks::{Halves, LANES, MatchBlock, PairBlocks, add_halves, sum_lanes};
 use crate::ransac::Scorer;
 use cv_core::{Correspondence, Matrix3, Vector3};
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
-use fearless_simd::{Level, dispatch};
+use fearless_simd::{Level, dispatch, f64x8, prelude::*};
 use nalgebra::{Const, OMatrix, OVector, SMatrix, SVector};
 use std::marker::PhantomData;
 
@@ -22,92 +22,121 @@ pub(crate) trait Epipolar<const N: usize>: Clone {
 
 /// Minimizes the robust Sampson error `Σ ρ(sampson² / threshold²)` over a parameterization.
 pub(crate) struct SampsonProblem<'a, M, const N: usize> {
-    pub(crate) pairs: &'a [[f64; 4]],
+    pub(crate) pairs: &'a PairBlocks,
     pub(crate) scorer: &'a dyn Scorer,
     pub(crate) threshold: f64,
     parameterization: PhantomData<M>,
 }
 
 impl<'a, M: Epipolar<N>, const N: usize> SampsonProblem<'a, M, N> {
-    pub(crate) fn new(pairs: &'a [[f64; 4]], scorer: &'a dyn Scorer, threshold: f64) -> Self {
+    pub(crate) fn new(pairs: &'a PairBlocks, scorer: &'a dyn Scorer, threshold: f64) -> Self {
         Self { pairs, scorer, threshold, parameterization: PhantomData }
     }
 
-    /// Computes the first two entries of `F a` and of `Fᵀ b`, `C = bᵀ F a`, `1/D` (D the sum of their squares), and
-    /// `u`.
+    /// Computes the terms of a block, whose first `count` lanes hold pairs.
     #[inline(always)]
-    fn terms(&self, f: &Matrix3<f64>, &[x, y, s, t]: &[f64; 4]) -> ([f64; 2], [f64; 2], f64, f64, f64) {
-        let l0 = f[(0, 0)] * x + f[(0, 1)] * y + f[(0, 2)];
-        let l1 = f[(1, 0)] * x + f[(1, 1)] * y + f[(1, 2)];
-        let l2 = f[(2, 0)] * x + f[(2, 1)] * y + f[(2, 2)];
-        let m0 = f[(0, 0)] * s + f[(1, 0)] * t + f[(2, 0)];
-        let m1 = f[(0, 1)] * s + f[(1, 1)] * t + f[(2, 1)];
-        let c = s * l0 + t * l1 + l2;
-        let inverse = 1.0 / (l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1);
-        ([l0, l1], [m0, m1], c, inverse, c * c * inverse / (self.threshold * self.threshold))
+    fn terms<S: Simd>(&self, simd: S, f: &[f64; 9], block: &[Halves; 4], count: usize) -> Terms<S> {
+        let inverse_threshold2 = 1.0 / (self.threshold * self.threshold);
+        let first = TermsHalf::new(simd, f, block, 0);
+        let second = TermsHalf::new(simd, f, block, 1);
+        let mut u = [0.0; LANES];
+        let (u_first, u_second) = u.split_at_mut(LANES / 2);
+        (first.c * first.c * first.inverse * inverse_threshold2).store_slice(u_first);
+        (second.c * second.c * second.inverse * inverse_threshold2).store_slice(u_second);
+        // Padding lanes have a loss of 1.
+        u[count..].fill(f64::NAN);
+        let (mut losses, mut weights) = ([0.0; LANES], [0.0; LANES]);
+        self.scorer.losses_and_weights(&u, &mut losses, &mut weights);
+        Terms { halves: [first, second], losses, weights }
     }
 
     /// Computes the cost.
     #[inline(always)]
-    fn sum(&self, f: &Matrix3<f64>) -> f64 {
-        let cutoff = self.scorer.cutoff();
-        let mut cost = 0.0;
-        for pair in self.pairs {
-            let u = self.terms(f, pair).4;
-            cost += if u < cutoff { f64::from(self.scorer.loss(u as f32)) } else { 1.0 };
+    fn sum<S: Simd>(&self, simd: S, f: &Matrix3<f64>) -> f64 {
+        let f = std::array::from_fn(|i| f[(i / 3, i % 3)]);
+        let mut cost = f64x8::splat(simd, 0.0);
+        for (block, count) in self.pairs.iter() {
+            let terms = self.terms(simd, &f, block, count);
+            cost += add_halves(simd, &terms.losses);
         }
-        cost
+        sum_lanes(cost) - self.pairs.padding() as f64
     }
 
     /// Computes the cost and the normal equations.
     #[inline(always)]
-    fn sums(&self, f: &Matrix3<f64>) -> Sums {
-        let (mut hessian, mut last, mut gradient) = ([[0.0; 8]; 8], [0.0; 8], [0.0; 8]);
-        let (mut cost, mut sum, mut weighted) = (0.0, 0.0, 0.0);
-        let cutoff = self.scorer.cutoff();
-        for pair in self.pairs {
-            let (l, m, c, inverse, u) = self.terms(f, pair);
-            // False for NaN.
-            let is_below_cutoff = u < cutoff;
-            if !is_below_cutoff {
-                cost += 1.0;
-                continue;
-            }
-            cost += f64::from(self.scorer.loss(u as f32));
-            let [x, y, s, t] = *pair;
-            let weight = self.scorer.weight(u) * inverse;
-            // r = C/√D: ∂r = (∂C − C ∂D/(2D))/√D; ∂D/2 = l ∂l + m ∂m.
-            let k = c * inverse;
-            let (p0, p1, q0, q1) = (s - k * l[0], t - k * l[1], k * m[0], k * m[1]);
-            let g = [p0 * x - q0 * s, p0 * y - q1 * s, p0, p1 * x - q0 * t, p1 * y - q1 * t, p1, x - q0, y - q1];
-            let w = g.map(|g| weight * g);
-            for i in 0..8 {
-                for j in 0..8 {
-                    hessian[i][j] += w[i] * g[j];
+    fn sums<S: Simd>(&self, simd: S, f: &Matrix3<f64>) -> Sums {
+        let f = std::array::from_fn(|i| f[(i / 3, i % 3)]);
+        let zero = f64x8::splat(simd, 0.0);
+        let (mut cost, mut hessian, mut gradient) = (zero, [[zero; 9]; 9], [zero; 9]);
+        for (block, count) in self.pairs.iter() {
+            let terms = self.terms(simd, &f, block, count);
+            cost += add_halves(simd, &terms.losses);
+            for (half, TermsHalf { pair: [x, y, s, t], l, m, c, inverse }) in terms.halves.into_iter().enumerate() {
+                let weight = f64x8::from_slice(simd, &terms.weights[half * LANES / 2..][..LANES / 2]);
+                // Terms beyond the cutoff may be infinite or NaN, which a weight of 0 does not remove.
+                let is_unused = weight.simd_eq(zero);
+                // r = C/√D: ∂r = (∂C − C ∂D/(2D))/√D; ∂D/2 = l ∂l + m ∂m.
+                let k = c * inverse;
+                let (p0, p1) = (is_unused.select(zero, s - k * l[0]), is_unused.select(zero, t - k * l[1]));
+                let (q0, q1) = (is_unused.select(zero, k * m[0]), is_unused.select(zero, k * m[1]));
+                let one = f64x8::splat(simd, 1.0);
+                let g =
+                    [p0 * x - q0 * s, p0 * y - q1 * s, p0, p1 * x - q0 * t, p1 * y - q1 * t, p1, x - q0, y - q1, one];
+                let (weight, c) = (is_unused.select(zero, weight * inverse), is_unused.select(zero, c));
+                for i in 0..9 {
+                    let w = weight * g[i];
+                    for j in i..9 {
+                        hessian[i][j] += w * g[j];
+                    }
+                    gradient[i] += w * c;
                 }
             }
-            for j in 0..8 {
-                last[j] += w[j];
-                gradient[j] += w[j] * c;
-            }
-            sum += weight;
-            weighted += weight * c;
         }
-        Sums { cost, hessian, last, weight: sum, gradient, weighted }
+        Sums {
+            cost: sum_lanes(cost) - self.pairs.padding() as f64,
+            hessian: std::array::from_fn(|i| std::array::from_fn(|j| sum_lanes(hessian[i][j]))),
+            gradient: std::array::from_fn(|i| sum_lanes(gradient[i])),
+        }
     }
 }
 
-/// Cost, gradient and Gauss–Newton Hessian by the nine entries of the matrix. The last entry, whose derivative is 1, is
-/// separate, so that the others fill SIMD vectors of four or eight.
+/// The terms of a block of pairs.
+struct Terms<S: Simd> {
+    halves: [TermsHalf<S>; 2],
+    losses: [f64; LANES],
+    weights: [f64; LANES],
+}
+
+/// The pairs, the first two entries of `F a` and of `Fᵀ b`, `C = bᵀ F a`, and `1/D` (D the sum of the squares of the
+/// four entries).
+struct TermsHalf<S: Simd> {
+    pair: [f64x8<S>; 4],
+    l: [f64x8<S>; 2],
+    m: [f64x8<S>; 2],
+    c: f64x8<S>,
+    inverse: f64x8<S>,
+}
+
+impl<S: Simd> TermsHalf<S> {
+    #[inline(always)]
+    fn new(simd: S, f: &[f64; 9], block: &[Halves; 4], half: usize) -> Self {
+        let x = f64x8::from_slice(simd, &block[0][half]);
+        let y = f64x8::from_slice(simd, &block[1][half]);
+        let s = f64x8::from_slice(simd, &block[2][half]);
+        let t = f64x8::from_slice(simd, &block[3][half]);
+        let l = [x * f[0] + y * f[1] + f[2], x * f[3] + y * f[4] + f[5]];
+        let m = [s * f[0] + t * f[3] + f[6], s * f[1] + t * f[4] + f[7]];
+        let c = s * l[0] + t * l[1] + (x * f[6] + y * f[7] + f[8]);
+        let inverse = 1.0 / (l[0] * l[0] + l[1] * l[1] + m[0] * m[0] + m[1] * m[1]);
+        Self { pair: [x, y, s, t], l, m, c, inverse }
+    }
+}
+
+/// Cost, gradient and Gauss–Newton Hessian (the upper triangle) by the nine entries of the matrix, row-major.
 struct Sums {
     cost: f64,
-    hessian: [[f64; 8]; 8],
-    /// The last column of the Hessian without the diagonal entry, which is `weight`.
-    last: [f64; 8],
-    weight: f64,
-    gradient: [f64; 8],
-    /// The last entry of the gradient.
-    weighted: f64,
+    hessian: [[f64; 9]; 9],
+    gradient: [f64; 9],
 }
 
 impl<M: Epipolar<N>, const N: usize> LeastSquares for SampsonProblem<'_, M, N> {
@@ -120,24 +149,16 @@ impl<M: Epipolar<N>, const N: usize> LeastSquares for SampsonProblem<'_, M, N> {
 
     fn cost(&self, f: &M) -> f64 {
         let matrix = f.matrix();
-        dispatch!(Level::new(), _simd => self.sum(&matrix))
+        dispatch!(Level::new(), simd => self.sum(simd, &matrix))
     }
 
     fn linearize(&self, f: &M) -> NormalEquations<Const<N>> {
         let matrix = f.matrix();
         // No product is fused, so all instruction sets give identical results.
-        let sums = dispatch!(Level::new(), _simd => self.sums(&matrix));
+        let sums = dispatch!(Level::new(), simd => self.sums(simd, &matrix));
         let tangent = f.tangent();
-        let mut hessian = SMatrix::<f64, 9, 9>::zeros();
-        let mut gradient = SVector::<f64, 9>::zeros();
-        for i in 0..8 {
-            for j in 0..8 {
-                hessian[(i, j)] = sums.hessian[i][j];
-            }
-            (hessian[(i, 8)], hessian[(8, i)]) = (sums.last[i], sums.last[i]);
-            gradient[i] = sums.gradient[i];
-        }
-        (hessian[(8, 8)], gradient[8]) = (sums.weight, sums.weighted);
+        let hessian = SMatrix::<f64, 9, 9>::from_fn(|r, c| sums.hessian[r.min(c)][r.max(c)]);
+        let gradient = SVector::from(sums.gradient);
         let gradient = tangent.transpose() * gradient;
         let hessian = tangent.transpose() * hessian * tangent;
         NormalEquations {

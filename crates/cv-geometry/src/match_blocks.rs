@@ -3,6 +3,7 @@
 use crate::ransac::RansacData;
 use crate::{EstimateError, error::Degeneracy};
 use cv_core::{Correspondence, Matrix3, Point2, Vector3, median};
+use fearless_simd::{f64x8, prelude::*};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::{Rng, SeedableRng};
 
@@ -51,6 +52,54 @@ impl Normalizer {
     }
 }
 
+/// A block of [`LANES`] values in f64, half of them in each array: one AVX-512 register, two of AVX2.
+pub(crate) type Halves = [[f64; LANES / 2]; 2];
+
+/// Correspondences in f64 as blocks of [`LANES`] (structure of arrays): x1, y1, x2, y2. Sums over them in vectors.
+#[derive(Debug, Clone)]
+pub(crate) struct PairBlocks {
+    blocks: Vec<[Halves; 4]>,
+    /// Number of pairs.
+    count: usize,
+}
+
+impl PairBlocks {
+    pub(crate) fn new(pairs: &[[f64; 4]]) -> Self {
+        let lane = |chunk: &[[f64; 4]], k: usize, i: usize| chunk.get(i).map_or(0.0, |pair| pair[k]);
+        let halves = |chunk: &[[f64; 4]], k: usize| -> Halves {
+            std::array::from_fn(|half| std::array::from_fn(|i| lane(chunk, k, half * LANES / 2 + i)))
+        };
+        let blocks = pairs.chunks(LANES).map(|chunk| std::array::from_fn(|k| halves(chunk, k))).collect();
+        Self { blocks, count: pairs.len() }
+    }
+
+    /// Returns the blocks, each with the number of its lanes that hold pairs.
+    #[inline(always)]
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (&[Halves; 4], usize)> {
+        self.blocks.iter().enumerate().map(|(index, block)| (block, (self.count - index * LANES).min(LANES)))
+    }
+
+    /// Returns the number of lanes after the last pair.
+    pub(crate) fn padding(&self) -> usize {
+        self.blocks.len() * LANES - self.count
+    }
+}
+
+/// Adds the halves of a block.
+#[inline(always)]
+pub(crate) fn add_halves<S: Simd>(simd: S, values: &[f64; LANES]) -> f64x8<S> {
+    let (first, second) = values.split_at(LANES / 2);
+    f64x8::from_slice(simd, first) + f64x8::from_slice(simd, second)
+}
+
+/// Sums the lanes pairwise, in a fixed order.
+#[inline(always)]
+pub(crate) fn sum_lanes<S: Simd>(lanes: f64x8<S>) -> f64 {
+    let mut v = [0.0; LANES / 2];
+    lanes.store_slice(&mut v);
+    ((v[0] + v[4]) + (v[1] + v[5])) + ((v[2] + v[6]) + (v[3] + v[7]))
+}
+
 /// Normalized correspondences, in the caller's order in f64 and shuffled into blocks in f32.
 ///
 /// Center and scale are medians, so they are robust to outliers with extreme coordinates. Both images have the same
@@ -59,6 +108,8 @@ impl Normalizer {
 pub(crate) struct NormalizedMatches {
     /// Normalized, in the caller's order: x1, y1, x2, y2.
     pub(crate) pairs: Vec<[f64; 4]>,
+    /// The same in blocks.
+    pub(crate) pair_blocks: PairBlocks,
     /// The same in random order: the first blocks are a random sample of all matches.
     pub(crate) blocks: Vec<MatchBlock>,
     /// The index in `pairs` of each lane of `blocks`.
@@ -119,7 +170,7 @@ impl NormalizedMatches {
             .chunks(LANES)
             .map(|c| MatchBlock { x1: lane(c, 0), y1: lane(c, 1), x2: lane(c, 2), y2: lane(c, 3) })
             .collect();
-        Self { pairs, blocks, order, first, second }
+        Self { pair_blocks: PairBlocks::new(&pairs), pairs, blocks, order, first, second }
     }
 }
 

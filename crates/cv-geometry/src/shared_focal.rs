@@ -3,7 +3,9 @@
 use crate::epipolar::{Epipolar, SampsonKernel, SampsonProblem, refine_sampson, sampson};
 use crate::error::{Degeneracy, EstimateError};
 use crate::essential::{decompose_essential, essential_from_pose, in_front};
-use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, Normalizer, check_matches, point_degeneracy};
+use crate::match_blocks::{
+    LANES, MatchBlock, NormalizedMatches, Normalizer, PairBlocks, check_matches, point_degeneracy,
+};
 use crate::ransac::{Estimator, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
@@ -90,6 +92,7 @@ pub fn refine_shared_focal_pose(
         [m.a.x / largest_coordinate, m.a.y / largest_coordinate, m.b.x / largest_coordinate, m.b.y / largest_coordinate]
     };
     let pairs: Vec<[f64; 4]> = matches.iter().map(scaled).collect();
+    let pairs = PairBlocks::new(&pairs);
     let problem = SampsonProblem::new(&pairs, &TukeyBiweight, threshold / largest_coordinate);
     let start = start.scaled(1.0 / largest_coordinate);
     let refined = refine_sampson(&problem, start, 50).and_then(with_orthonormal_rotation).unwrap_or(start);
@@ -193,7 +196,7 @@ impl Estimator for FocalEstimator {
         threshold: f64,
         iterations: usize,
     ) -> Option<SharedFocalPose> {
-        let problem = SampsonProblem::new(&self.set.pairs, scorer, threshold);
+        let problem = SampsonProblem::new(&self.set.pair_blocks, scorer, threshold);
         refine_sampson(&problem, *model, iterations).and_then(with_orthonormal_rotation)
     }
 }

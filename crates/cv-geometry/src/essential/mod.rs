@@ -13,7 +13,9 @@ pub use jackknife::{jackknife_pose_deviation, pose_difference, poses_are_indisti
 
 use crate::epipolar::{Epipolar, SampsonKernel, SampsonProblem, refine_sampson, sampson};
 use crate::error::{Degeneracy, EstimateError};
-use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, Normalizer, check_matches, ray_degeneracy};
+use crate::match_blocks::{
+    LANES, MatchBlock, NormalizedMatches, Normalizer, PairBlocks, check_matches, ray_degeneracy,
+};
 use crate::ransac::{Estimator, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
 use crate::rotation::orthonormalized;
@@ -88,6 +90,7 @@ pub fn estimate_essential(
 /// normalized units.
 pub fn refine_relative_pose(pose: &Pose, matches: &[Correspondence], threshold: f64) -> (Pose, f64) {
     let pairs: Vec<[f64; 4]> = matches.iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
+    let pairs = PairBlocks::new(&pairs);
     let problem = SampsonProblem::new(&pairs, &TukeyBiweight, threshold);
     let refined = refine_sampson(&problem, *pose, 30).and_then(with_orthonormal_rotation).unwrap_or(*pose);
     (refined, problem.cost(&refined))
@@ -261,7 +264,7 @@ impl Estimator for PoseEstimator {
     }
 
     fn refine(&self, model: &Pose, scorer: &dyn Scorer, threshold: f64, iterations: usize) -> Option<Pose> {
-        let problem = SampsonProblem::new(&self.set.pairs, scorer, threshold);
+        let problem = SampsonProblem::new(&self.set.pair_blocks, scorer, threshold);
         refine_sampson(&problem, *model, iterations).and_then(with_orthonormal_rotation)
     }
 }

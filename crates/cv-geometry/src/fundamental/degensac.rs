@@ -3,7 +3,7 @@
 
 use crate::epipolar::second_epipole;
 use crate::homography::refine_robustly;
-use crate::match_blocks::random_below;
+use crate::match_blocks::{NormalizedMatches, random_below};
 use cv_core::{Matrix3, Vector3};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -19,16 +19,17 @@ const MAX_PAIRS: usize = 200;
 /// Appends the fundamental matrices of the plane's homography and two off-plane points (plane and parallax), if five
 /// points of the sample are coplanar.
 pub(super) fn alternatives(
-    pairs: &[[f64; 4]],
+    set: &NormalizedMatches,
     f: &Matrix3<f64>,
     sample: &[u32],
     threshold: f64,
     models: &mut Vec<Matrix3<f64>>,
 ) {
-    let Some(h) = degenerate_plane(pairs, f, sample, PLANE_THRESHOLD_RATIO * threshold) else { return };
+    let Some(h) = degenerate_plane(&set.pairs, f, sample, PLANE_THRESHOLD_RATIO * threshold) else { return };
     let limit = PLANE_THRESHOLD_RATIO * threshold;
-    let h = refine_robustly(pairs, &h, limit);
-    let parallax_lines: Vec<Vector3<f64>> = pairs
+    let h = refine_robustly(&set.pair_blocks, &h, limit);
+    let parallax_lines: Vec<Vector3<f64>> = set
+        .pairs
         .iter()
         .filter(|p| squared_transfer_error(&h, p) > limit * limit)
         .map(|p| (h * Vector3::new(p[0], p[1], 1.0)).cross(&Vector3::new(p[2], p[3], 1.0)))

@@ -130,29 +130,31 @@ impl Estimator for FundamentalEstimator {
         threshold: f64,
         iterations: usize,
     ) -> Option<Matrix3<f64>> {
-        let problem = SampsonProblem::new(&self.set.pairs, scorer, threshold);
+        let problem = SampsonProblem::new(&self.set.pair_blocks, scorer, threshold);
         refine_sampson(&problem, RankTwo::new(model)?, iterations).map(|f| f.matrix().normalize())
     }
 
     fn alternatives(&self, model: &Matrix3<f64>, sample: &[u32], threshold: f64, models: &mut Vec<Matrix3<f64>>) {
-        degensac::alternatives(&self.set.pairs, model, sample, threshold, models);
+        degensac::alternatives(&self.set, model, sample, threshold, models);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ransac::LeastSquaresLoss;
+    use crate::match_blocks::PairBlocks;
+    use crate::ransac::{LeastSquaresLoss, TukeyBiweight};
     use crate::testing::TwoViews;
     use cv_numeric::LeastSquares as _;
     use proptest::prelude::*;
 
     proptest! {
         #[test]
-        fn the_analytic_gradient_equals_the_numeric_one(seed: u64) {
+        fn the_analytic_gradient_equals_the_numeric_one(seed: u64, count in 15usize..40) {
             let views = TwoViews::random(seed);
-            let pairs: Vec<[f64; 4]> = views.normalized_matches(15, 1e-3).iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
-            let problem = SampsonProblem::new(&pairs, &LeastSquaresLoss, 1.0);
+            let pairs: Vec<[f64; 4]> = views.normalized_matches(count, 1e-3).iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
+            let blocks = PairBlocks::new(&pairs);
+            let problem = SampsonProblem::new(&blocks, &LeastSquaresLoss, 1.0);
             let start = RankTwo::new(&views.essential()).unwrap();
             let start = start.step(&nalgebra::SVector::from([0.01, -0.02, 0.01, 0.02, 0.01, -0.01, 0.02]));
             let gradient = problem.linearize(&start).gradient;
@@ -167,6 +169,37 @@ mod tests {
                 // Central differences: h² truncation and rounding over h; the gradient is half the derivative of Σr².
                 prop_assert!((0.5 * numeric - gradient[i]).abs() < 1e-6 + 1e-4 * gradient.amax(), "{i} {numeric} {}", gradient[i]);
             }
+        }
+
+        #[test]
+        fn matches_beyond_the_cutoff_change_only_the_cost(seed: u64, count in 15usize..40, outliers in 0usize..40) {
+            let views = TwoViews::random(seed);
+            let pair = |m: &Correspondence| [m.a.x, m.a.y, m.b.x, m.b.y];
+            let mut pairs: Vec<[f64; 4]> = views.normalized_matches(count, 1e-3).iter().map(pair).collect();
+            let model = RankTwo::new(&views.essential()).unwrap();
+            let linearize = |pairs: &[[f64; 4]]| {
+                let blocks = PairBlocks::new(pairs);
+                let problem = SampsonProblem::new(&blocks, &TukeyBiweight, 0.01);
+                let equations = problem.linearize(&model);
+                assert_eq!(problem.cost(&model), equations.cost);
+                equations
+            };
+            let expected = linearize(&pairs);
+            let f = model.matrix();
+            // The products overflow: infinity times zero.
+            let mut beyond = vec![[1e200; 4]];
+            let is_beyond = |m: &Correspondence| sampson(&f, m) > 0.1;
+            beyond.extend(views.outliers(outliers).iter().map(|m| views.normalize(m)).filter(is_beyond).map(|m| pair(&m)));
+            // In between, in any lane.
+            for (i, p) in beyond.iter().enumerate() {
+                pairs.insert((7 * i + seed as usize % 5) % pairs.len(), *p);
+            }
+            let found = linearize(&pairs);
+            // Sums of a hundred terms in another order.
+            let tolerance = 1e-12;
+            prop_assert!((found.cost - expected.cost - beyond.len() as f64).abs() < tolerance * found.cost);
+            prop_assert!((found.gradient - expected.gradient).amax() < tolerance * (1.0 + expected.gradient.amax()));
+            prop_assert!((found.hessian - expected.hessian).amax() < tolerance * expected.hessian.amax());
         }
 
         #[test]

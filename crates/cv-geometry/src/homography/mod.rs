@@ -8,7 +8,7 @@ pub use dlt::homography_from_points;
 pub use four_point::homography_four_point;
 
 use crate::error::EstimateError;
-use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, point_degeneracy};
+use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, PairBlocks, point_degeneracy};
 use crate::ransac::LeastSquaresLoss;
 use crate::ransac::{Estimator, RobustOptions, Scorer, TukeyBiweight, ransac};
 use crate::robust::RobustModel;
@@ -84,13 +84,13 @@ pub fn estimate_homography(
 pub fn refine_homography(h: &Matrix3<f64>, matches: &[Correspondence]) -> Result<Matrix3<f64>, EstimateError> {
     let set = NormalizedMatches::new(matches, 4)?;
     let normalized = set.second.matrix() * h * set.first.inverse_matrix();
-    let problem = TransferProblem { pairs: &set.pairs, scorer: &LeastSquaresLoss, threshold: 1.0 };
+    let problem = TransferProblem { pairs: &set.pair_blocks, scorer: &LeastSquaresLoss, threshold: 1.0 };
     let refined = refine_transfer(&problem, &normalized, 50).unwrap_or(normalized);
     Ok(dlt::normalize_scale(&(set.second.inverse_matrix() * refined * set.first.matrix())))
 }
 
 /// Refines `h` by minimizing the robust symmetric transfer error (Tukey's biweight) of normalized pairs.
-pub(crate) fn refine_robustly(pairs: &[[f64; 4]], h: &Matrix3<f64>, threshold: f64) -> Matrix3<f64> {
+pub(crate) fn refine_robustly(pairs: &PairBlocks, h: &Matrix3<f64>, threshold: f64) -> Matrix3<f64> {
     let problem = TransferProblem { pairs, scorer: &TukeyBiweight, threshold };
     refine_transfer(&problem, h, 10).unwrap_or(*h)
 }
@@ -180,7 +180,7 @@ impl Estimator for HomographyEstimator {
         threshold: f64,
         iterations: usize,
     ) -> Option<Matrix3<f64>> {
-        let problem = TransferProblem { pairs: &self.set.pairs, scorer, threshold };
+        let problem = TransferProblem { pairs: &self.set.pair_blocks, scorer, threshold };
         refine_transfer(&problem, model, iterations)
     }
 }
@@ -196,31 +196,63 @@ mod tests {
     use rand_chacha::rand_core::SeedableRng;
 
     /// The cost in f64: the problem's own cost has f32 losses and is not precise enough.
-    fn plain_cost(problem: &TransferProblem<'_>, h: &Matrix3<f64>) -> f64 {
+    fn plain_cost(pairs: &[[f64; 4]], h: &Matrix3<f64>) -> f64 {
         let residual = |p: &[f64; 4]| homography_residual(h, &Correspondence::new(p[0], p[1], p[2], p[3]));
-        problem.pairs.iter().map(|p| residual(p).powi(2)).sum()
+        pairs.iter().map(|p| residual(p).powi(2)).sum()
     }
 
     proptest! {
         #[test]
-        fn the_analytic_gradient_equals_the_numeric_one(h in a_homography(), seed: u64) {
-            let m = matches(&h, 12, 0.01, &mut ChaCha8Rng::seed_from_u64(seed));
+        fn the_analytic_gradient_equals_the_numeric_one(h in a_homography(), count in 12usize..40, seed: u64) {
+            let m = matches(&h, count, 0.01, &mut ChaCha8Rng::seed_from_u64(seed));
             let set = NormalizedMatches::new(&m, 4).unwrap();
-            let problem = TransferProblem { pairs: &set.pairs, scorer: &LeastSquaresLoss, threshold: 1.0 };
+            let problem = TransferProblem { pairs: &set.pair_blocks, scorer: &LeastSquaresLoss, threshold: 1.0 };
             let start = set.second.matrix() * h * set.first.inverse_matrix();
             let start = start / start[(2, 2)];
             let start = problem.step(&start, &SVector::from([0.02, -0.01, 0.03, 0.01, 0.02, -0.03, 0.005, -0.004]));
-            prop_assume!(problem.cost(&start).is_finite() && problem.cost(&start) < 12.0);
+            prop_assume!(problem.cost(&start).is_finite() && problem.cost(&start) < count as f64);
             let equations = problem.linearize(&start);
             for i in 0..8 {
                 let step = 1e-6;
                 let mut d = SVector::<f64, 8>::zeros();
                 d[i] = step;
-                let numeric = (plain_cost(&problem, &problem.step(&start, &d)) - plain_cost(&problem, &problem.step(&start, &-d))) / (2.0 * step);
+                let numeric = (plain_cost(&set.pairs, &problem.step(&start, &d)) - plain_cost(&set.pairs, &problem.step(&start, &-d))) / (2.0 * step);
                 // The cost is Σ r² with r² = (d₁² + d₂²)/2, its gradient Σ (d₁ d₁' + d₂ d₂') = the accumulated one.
                 let size = equations.gradient.amax().max(1e-3);
                 prop_assert!((numeric - equations.gradient[i]).abs() < 1e-4 * size, "{i}: {numeric} {}", equations.gradient[i]);
             }
+        }
+
+        #[test]
+        fn matches_beyond_the_cutoff_change_only_the_cost(h in a_homography(), count in 12usize..40, seed: u64) {
+            let m = matches(&h, count, 0.5, &mut ChaCha8Rng::seed_from_u64(seed));
+            let set = NormalizedMatches::new(&m, 4).unwrap();
+            let model = set.second.matrix() * h * set.first.inverse_matrix();
+            let model = model / model[(2, 2)];
+            let linearize = |pairs: &[[f64; 4]]| {
+                let blocks = PairBlocks::new(pairs);
+                let problem = TransferProblem { pairs: &blocks, scorer: &TukeyBiweight, threshold: 3.0 * set.first.scale };
+                let equations = problem.linearize(&model);
+                assert_eq!(problem.cost(&model), equations.cost);
+                equations
+            };
+            let mut pairs = set.pairs.clone();
+            let expected = linearize(&pairs);
+            // Far away; on the line that maps to infinity (division by zero); behind the camera.
+            let line = model.row(2);
+            let [a, b, c] = [line[0], line[1], line[2]];
+            let norm = a * a + b * b;
+            prop_assume!(norm > 1e-6);
+            let beyond = [[100.0, 100.0, 0.0, 0.0], [-a * c / norm, -b * c / norm, 0.0, 0.0], [-2.0 * a * c / norm, -2.0 * b * c / norm, 0.0, 0.0]];
+            for (i, p) in beyond.iter().enumerate() {
+                pairs.insert((7 * i + seed as usize % 5) % pairs.len(), *p);
+            }
+            let found = linearize(&pairs);
+            // Sums of a hundred terms in another order.
+            let tolerance = 1e-12;
+            prop_assert!((found.cost - expected.cost - beyond.len() as f64).abs() < tolerance * found.cost);
+            prop_assert!((found.gradient - expected.gradient).amax() < tolerance * (1.0 + expected.hessian.amax()));
+            prop_assert!((found.hessian - expected.hessian).amax() < tolerance * expected.hessian.amax());
         }
 
         #[test]

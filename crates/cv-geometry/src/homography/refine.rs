@@ -1,57 +1,79 @@
 //! Refinement of a homography on the symmetric transfer error.
 
+use crate::match_blocks::{Halves, LANES, PairBlocks, add_halves, sum_lanes};
 use crate::ransac::Scorer;
 use cv_core::Matrix3;
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
-use fearless_simd::{Level, dispatch};
+use fearless_simd::{Level, dispatch, f64x8, prelude::*};
 use nalgebra::{Const, SMatrix, SVector};
 
 /// Minimizes the robust symmetric transfer error `Σ ρ((d₁² + d₂²)/2 / threshold²)` over the eight entries other than
 /// `H[2][2] = 1`. `d₂` is the distance from `b` to `H a`, `d₁` that from `a` to `H⁻¹ b`.
 pub(crate) struct TransferProblem<'a> {
-    pub(crate) pairs: &'a [[f64; 4]],
+    pub(crate) pairs: &'a PairBlocks,
     pub(crate) scorer: &'a dyn Scorer,
     pub(crate) threshold: f64,
 }
 
 /// Normal equations of one transfer direction, by the nine entries of the matrix that maps `p`, as the moments `Σ k u^i
-/// v^j p pᵀ`.
-#[derive(Clone, Copy)]
-struct TransferSums {
-    /// For each of xx, xy, yy, x, y, 1: Σ k, Σ k u, Σ k v, Σ k (u² + v²), in SIMD-friendly groups of four.
-    moments: [[f64; 4]; 6],
+/// v^j p pᵀ`; the lanes are summed separately.
+struct TransferSums<S: Simd> {
+    /// Σ k, Σ k u, Σ k v, Σ k (u² + v²); of each for xx, xy, yy, x, y, 1.
+    moments: [[f64x8<S>; 6]; 4],
     /// Gradient of half the cost by the nine entries, row-major.
-    gradient: [f64; 9],
+    gradient: [f64x8<S>; 9],
 }
 
-impl TransferSums {
-    const ZERO: Self = Self { moments: [[0.0; 4]; 6], gradient: [0.0; 9] };
-
-    /// Adds a point `(x, y)` that maps to `(u, v)` with denominator `w`, with the residual `(ru, rv)`.
+impl<S: Simd> TransferSums<S> {
     #[inline(always)]
-    fn add(&mut self, [x, y]: [f64; 2], [u, v, inverse_w]: [f64; 3], [ru, rv]: [f64; 2], weight: f64) {
-        let k = weight * inverse_w * inverse_w;
-        let p = [x * x, x * y, y * y, x, y, 1.0];
-        let factors = [k, k * u, k * v, k * (u * u + v * v)];
-        for (m, q) in self.moments.iter_mut().zip(p) {
-            for (sum, f) in m.iter_mut().zip(factors) {
-                *sum += f * q;
+    fn new(simd: S) -> Self {
+        let zero = f64x8::splat(simd, 0.0);
+        Self { moments: [[zero; 6]; 4], gradient: [zero; 9] }
+    }
+
+    /// Adds points `(x, y)` that map to `mapped`, with the targets `(s, t)`.
+    #[inline(always)]
+    fn add(&mut self, [x, y]: [f64x8<S>; 2], mapped: &Mapped<S>, [s, t]: [f64x8<S>; 2], weight: f64x8<S>) {
+        let (zero, one) = (f64x8::splat(x.simd, 0.0), f64x8::splat(x.simd, 1.0));
+        // Terms beyond the cutoff may be infinite or NaN, which a weight of 0 does not remove.
+        let is_unused = weight.simd_eq(zero);
+        let (u, v) = (is_unused.select(zero, mapped.u), is_unused.select(zero, mapped.v));
+        let inverse_w = is_unused.select(zero, mapped.inverse_w);
+        let g = weight * inverse_w;
+        let k = g * inverse_w;
+        let p = [x * x, x * y, y * y, x, y, one];
+        for (sums, factor) in self.moments.iter_mut().zip([k, k * u, k * v, k * (u * u + v * v)]) {
+            for (sum, p) in sums.iter_mut().zip(p) {
+                *sum += factor * p;
             }
         }
-        let g = weight * inverse_w;
-        let rows = [g * ru, g * rv, -g * (u * ru + v * rv)];
-        for (r, f) in rows.into_iter().enumerate() {
-            self.gradient[3 * r] += f * x;
-            self.gradient[3 * r + 1] += f * y;
-            self.gradient[3 * r + 2] += f;
+        let (ru, rv) = (u - s, v - t);
+        for (sums, row) in self.gradient.chunks_exact_mut(3).zip([g * ru, g * rv, -g * (u * ru + v * rv)]) {
+            for (sum, p) in sums.iter_mut().zip([x, y, one]) {
+                *sum += row * p;
+            }
         }
     }
 
+    /// Sums the lanes.
+    #[inline(always)]
+    fn total(&self) -> TransferEquations {
+        let moments = std::array::from_fn(|k| std::array::from_fn(|i| sum_lanes(self.moments[k][i])));
+        TransferEquations { moments, gradient: std::array::from_fn(|i| sum_lanes(self.gradient[i])) }
+    }
+}
+
+/// The sum of all lanes of [`TransferSums`].
+struct TransferEquations {
+    moments: [[f64; 6]; 4],
+    gradient: [f64; 9],
+}
+
+impl TransferEquations {
     /// Returns the Gauss–Newton Hessian.
     fn hessian(&self) -> SMatrix<f64, 9, 9> {
-        let m = &self.moments;
         let block = |k: usize| {
-            let [xx, xy, yy, x, y, one] = m.each_ref().map(|m| m[k]);
+            let [xx, xy, yy, x, y, one] = self.moments[k];
             Matrix3::new(xx, xy, x, xy, yy, y, x, y, one)
         };
         let [a, u, v, uv] = [0, 1, 2, 3].map(block);
@@ -64,53 +86,106 @@ impl TransferSums {
 }
 
 impl TransferProblem<'_> {
-    /// Computes `H a`, `1/w`, `H⁻¹ b`, `1/w'`, and `u`, which is NaN if a point maps behind the camera.
+    /// Computes the terms of a block, whose first `count` lanes hold pairs.
     #[inline(always)]
-    fn terms(&self, h: &Matrix3<f64>, g: &Matrix3<f64>, &[x, y, s, t]: &[f64; 4]) -> ([f64; 3], [f64; 3], f64) {
-        let wa = 1.0 / (h[(2, 0)] * x + h[(2, 1)] * y + h[(2, 2)]);
-        let wb = 1.0 / (g[(2, 0)] * s + g[(2, 1)] * t + g[(2, 2)]);
-        let p = (h[(0, 0)] * x + h[(0, 1)] * y + h[(0, 2)]) * wa;
-        let q = (h[(1, 0)] * x + h[(1, 1)] * y + h[(1, 2)]) * wa;
-        let m = (g[(0, 0)] * s + g[(0, 1)] * t + g[(0, 2)]) * wb;
-        let n = (g[(1, 0)] * s + g[(1, 1)] * t + g[(1, 2)]) * wb;
-        let d2 = (p - s) * (p - s) + (q - t) * (q - t) + (m - x) * (m - x) + (n - y) * (n - y);
-        let u = if wa > 0.0 && wb > 0.0 { d2 * (0.5 / (self.threshold * self.threshold)) } else { f64::NAN };
-        ([p, q, wa], [m, n, wb], u)
+    fn terms<S: Simd>(&self, simd: S, h: &[f64; 9], g: &[f64; 9], block: &[Halves; 4], count: usize) -> Terms<S> {
+        let scale = 0.5 / (self.threshold * self.threshold);
+        let first = TermsHalf::new(simd, h, g, block, 0);
+        let second = TermsHalf::new(simd, h, g, block, 1);
+        let mut u = [0.0; LANES];
+        let (u_first, u_second) = u.split_at_mut(LANES / 2);
+        (first.squared_distances() * scale).store_slice(u_first);
+        (second.squared_distances() * scale).store_slice(u_second);
+        // Padding lanes have a loss of 1.
+        u[count..].fill(f64::NAN);
+        let (mut losses, mut weights) = ([0.0; LANES], [0.0; LANES]);
+        self.scorer.losses_and_weights(&u, &mut losses, &mut weights);
+        Terms { halves: [first, second], losses, weights }
     }
 
     /// Computes the cost.
     #[inline(always)]
-    fn sum(&self, h: &Matrix3<f64>, g: &Matrix3<f64>) -> f64 {
-        let cutoff = self.scorer.cutoff();
-        let mut cost = 0.0;
-        for pair in self.pairs {
-            let u = self.terms(h, g, pair).2;
-            cost += if u < cutoff { f64::from(self.scorer.loss(u as f32)) } else { 1.0 };
+    fn sum<S: Simd>(&self, simd: S, h: &[f64; 9], g: &[f64; 9]) -> f64 {
+        let mut cost = f64x8::splat(simd, 0.0);
+        for (block, count) in self.pairs.iter() {
+            cost += add_halves(simd, &self.terms(simd, h, g, block, count).losses);
         }
-        cost
+        sum_lanes(cost) - self.pairs.padding() as f64
     }
 
     /// Computes the cost and the normal equations of both directions.
     #[inline(always)]
-    fn sums(&self, h: &Matrix3<f64>, g: &Matrix3<f64>) -> (f64, TransferSums, TransferSums) {
-        let (mut forward, mut backward) = (TransferSums::ZERO, TransferSums::ZERO);
-        let cutoff = self.scorer.cutoff();
-        let mut cost = 0.0;
-        for pair in self.pairs {
-            let (a, b, u) = self.terms(h, g, pair);
-            // False for NaN.
-            if u < cutoff {
-                let [x, y, s, t] = *pair;
-                cost += f64::from(self.scorer.loss(u as f32));
-                let weight = self.scorer.weight(u);
-                forward.add([x, y], a, [a[0] - s, a[1] - t], weight);
-                backward.add([s, t], b, [b[0] - x, b[1] - y], weight);
-            } else {
-                cost += 1.0;
+    fn sums<S: Simd>(&self, simd: S, h: &[f64; 9], g: &[f64; 9]) -> (f64, TransferEquations, TransferEquations) {
+        let (mut forward, mut backward) = (TransferSums::new(simd), TransferSums::new(simd));
+        let mut cost = f64x8::splat(simd, 0.0);
+        for (block, count) in self.pairs.iter() {
+            let terms = self.terms(simd, h, g, block, count);
+            cost += add_halves(simd, &terms.losses);
+            for (half, terms_half) in terms.halves.iter().enumerate() {
+                let weight = f64x8::from_slice(simd, &terms.weights[half * LANES / 2..][..LANES / 2]);
+                let [x, y, s, t] = terms_half.pair;
+                forward.add([x, y], &terms_half.forward, [s, t], weight);
+                backward.add([s, t], &terms_half.backward, [x, y], weight);
             }
         }
-        (cost, forward, backward)
+        (sum_lanes(cost) - self.pairs.padding() as f64, forward.total(), backward.total())
     }
+}
+
+/// The terms of a block of pairs. The loss is 1 where a point maps behind the camera.
+struct Terms<S: Simd> {
+    halves: [TermsHalf<S>; 2],
+    losses: [f64; LANES],
+    weights: [f64; LANES],
+}
+
+/// The pairs, `H a` and `H⁻¹ b`.
+struct TermsHalf<S: Simd> {
+    pair: [f64x8<S>; 4],
+    forward: Mapped<S>,
+    backward: Mapped<S>,
+}
+
+impl<S: Simd> TermsHalf<S> {
+    #[inline(always)]
+    fn new(simd: S, h: &[f64; 9], g: &[f64; 9], block: &[Halves; 4], half: usize) -> Self {
+        let x = f64x8::from_slice(simd, &block[0][half]);
+        let y = f64x8::from_slice(simd, &block[1][half]);
+        let s = f64x8::from_slice(simd, &block[2][half]);
+        let t = f64x8::from_slice(simd, &block[3][half]);
+        Self { pair: [x, y, s, t], forward: Mapped::new(h, x, y), backward: Mapped::new(g, s, t) }
+    }
+
+    /// Computes `d₁² + d₂²`; NaN where a point maps behind the camera.
+    #[inline(always)]
+    fn squared_distances(&self) -> f64x8<S> {
+        let ([x, y, s, t], forward, backward) = (self.pair, &self.forward, &self.backward);
+        let zero = f64x8::splat(x.simd, 0.0);
+        let (p, q, m, n) = (forward.u - s, forward.v - t, backward.u - x, backward.v - y);
+        let is_in_front = forward.inverse_w.simd_gt(zero) & backward.inverse_w.simd_gt(zero);
+        is_in_front.select(p * p + q * q + m * m + n * n, f64x8::splat(x.simd, f64::NAN))
+    }
+}
+
+/// Points mapped by a homography, with the inverse of their denominators.
+struct Mapped<S: Simd> {
+    u: f64x8<S>,
+    v: f64x8<S>,
+    inverse_w: f64x8<S>,
+}
+
+impl<S: Simd> Mapped<S> {
+    #[inline(always)]
+    fn new(h: &[f64; 9], x: f64x8<S>, y: f64x8<S>) -> Self {
+        let inverse_w = 1.0 / (x * h[6] + y * h[7] + h[8]);
+        let (u, v) = (x * h[0] + y * h[1] + h[2], x * h[3] + y * h[4] + h[5]);
+        Self { u: u * inverse_w, v: v * inverse_w, inverse_w }
+    }
+}
+
+/// Returns the entries, row-major.
+fn entries(m: &Matrix3<f64>) -> [f64; 9] {
+    std::array::from_fn(|i| m[(i / 3, i % 3)])
 }
 
 /// Inverts a homography with `H[2][2] = 1`; the denominators of the inverse are positive in front of the camera.
@@ -128,7 +203,8 @@ impl LeastSquares for TransferProblem<'_> {
 
     fn cost(&self, h: &Matrix3<f64>) -> f64 {
         let Some(g) = inverse(h) else { return f64::INFINITY };
-        dispatch!(Level::new(), _simd => self.sum(h, &g))
+        let (h, g) = (entries(h), entries(&g));
+        dispatch!(Level::new(), simd => self.sum(simd, &h, &g))
     }
 
     fn linearize(&self, h: &Matrix3<f64>) -> NormalEquations<Const<8>> {
@@ -138,7 +214,8 @@ impl LeastSquares for TransferProblem<'_> {
             return equations;
         };
         // No product is fused, so all instruction sets give identical results.
-        let (cost, forward, backward) = dispatch!(Level::new(), _simd => self.sums(h, &g));
+        let (rows, inverse_rows) = (entries(h), entries(&g));
+        let (cost, forward, backward) = dispatch!(Level::new(), simd => self.sums(simd, &rows, &inverse_rows));
         // dG = −G dH G: dG[i][j] = −Σ G[i][k] G[l][j] dH[k][l].
         let inverse_jacobian = SMatrix::<f64, 9, 9>::from_fn(|r, c| -g[(r / 3, c / 3)] * g[(c % 3, r % 3)]);
         let hessian = forward.hessian() + inverse_jacobian.transpose() * backward.hessian() * inverse_jacobian;

@@ -1,5 +1,8 @@
 //! Loss functions by which models are scored.
 
+use crate::match_blocks::LANES;
+use fearless_simd::{Level, dispatch};
+
 /// A robust loss ρ(u) of `u = (residual / threshold)²`, from 0 at `u = 0` to 1 for outliers (and for NaN).
 pub trait Scorer: std::fmt::Debug + Sync {
     /// Evaluates the loss. The implementations of this crate are `#[inline(always)]`: they run inside vectorized loops.
@@ -11,6 +14,21 @@ pub trait Scorer: std::fmt::Debug + Sync {
 
     /// Returns the `u` from which the loss is 1.
     fn cutoff(&self) -> f64;
+
+    /// Evaluates losses and weights of a block of residuals: 1 and 0 from the cutoff on, and for NaN.
+    ///
+    /// Provided: [`Scorer::loss`] and [`Scorer::weight`], inlined into a vectorized loop.
+    fn losses_and_weights(&self, u: &[f64; LANES], losses: &mut [f64; LANES], weights: &mut [f64; LANES]) {
+        dispatch!(Level::new(), _simd => {
+            let cutoff = self.cutoff();
+            for i in 0..LANES {
+                let is_below_cutoff = u[i] < cutoff;
+                let (loss, weight) = (f64::from(self.loss(u[i] as f32)), self.weight(u[i]));
+                losses[i] = if is_below_cutoff { loss } else { 1.0 };
+                weights[i] = if is_below_cutoff { weight } else { 0.0 };
+            }
+        })
+    }
 }
 
 /// Least squares, for inliers only.
@@ -75,7 +93,8 @@ impl Scorer for TukeyBiweight {
 
     #[inline(always)]
     fn weight(&self, u: f64) -> f64 {
-        let w = (1.0 - u / f64::from(BIWEIGHT_CUTOFF)).max(0.0);
+        let v = u * (1.0 / f64::from(BIWEIGHT_CUTOFF));
+        let w = if v < 1.0 { 1.0 - v } else { 0.0 };
         w * w
     }
 
@@ -105,6 +124,22 @@ mod tests {
             if u + 1e-3 * c < c {
                 let expected = scorer.weight(f64::from(u) + 5e-4 * f64::from(c)) * slope(0.0);
                 assert!((slope(u) - expected).abs() < 5e-3 * slope(0.0), "{u}: {} {expected}", slope(u));
+            }
+        }
+    }
+
+    #[test]
+    fn blocks_have_the_losses_and_weights_of_their_residuals() {
+        for scorer in [&Msac as &dyn Scorer, &TukeyBiweight] {
+            let c = scorer.cutoff();
+            let mut u: [f64; LANES] = std::array::from_fn(|i| c * i as f64 / 10.0);
+            (u[13], u[14], u[15]) = (f64::NAN, f64::INFINITY, f64::MAX);
+            let (mut losses, mut weights) = ([f64::NAN; LANES], [f64::NAN; LANES]);
+            scorer.losses_and_weights(&u, &mut losses, &mut weights);
+            for i in 0..LANES {
+                let plain =
+                    if u[i] < c { (f64::from(scorer.loss(u[i] as f32)), scorer.weight(u[i])) } else { (1.0, 0.0) };
+                assert_eq!((losses[i], weights[i]), plain, "{}", u[i]);
             }
         }
     }

@@ -2,6 +2,7 @@
 
 use super::{Intrinsics, TwoViewError, TwoViewOptions};
 use crate::homography::refine_robustly;
+use crate::match_blocks::PairBlocks;
 use crate::{
     EstimateError, RobustOptions, Scorer, TukeyBiweight, estimate_homography, estimate_rotation, homography_residual,
     normalize_matches,
@@ -147,7 +148,7 @@ impl PlaneSearch<'_> {
     fn refine_with_distortion(&self, other: &PlaneHypothesis, distortion: f64) -> PlaneHypothesis {
         let (matches, unit) = self.normalized(Some(distortion));
         let pairs: Vec<[f64; 4]> = matches.iter().map(|m| [m.a.x, m.a.y, m.b.x, m.b.y]).collect();
-        let homography = refine_robustly(&pairs, &other.homography, self.threshold * unit);
+        let homography = refine_robustly(&PairBlocks::new(&pairs), &other.homography, self.threshold * unit);
         let loss = self.loss(&homography, &matches, unit);
         PlaneHypothesis { distortion, matches, unit, homography, loss }
     }
