@@ -4,7 +4,7 @@
 //! sets give identical results; tests compare each with scalar loops.
 
 use crate::ByteScale;
-use fearless_simd::{Level, dispatch, prelude::*};
+use fearless_simd::{Level, dispatch, f32x16, prelude::*};
 
 /// Returns the widest instruction set of this machine.
 #[inline]
@@ -384,9 +384,14 @@ pub(crate) fn all_finite(level: Level, row: &[f32]) -> bool {
 }
 
 #[inline(always)]
-fn all_finite_impl<S: Simd>(_: S, row: &[f32]) -> bool {
+fn all_finite_impl<S: Simd>(simd: S, row: &[f32]) -> bool {
     // v·0 is 0 for finite v and NaN otherwise.
-    row.iter().fold(true, |good, v| good & (v * 0.0 == 0.0))
+    let mut sum = f32x16::splat(simd, 0.0);
+    let (blocks, rest) = row.as_chunks::<16>();
+    for block in blocks {
+        sum += f32x16::from_slice(simd, block) * 0.0;
+    }
+    sum.simd_eq(f32x16::splat(simd, 0.0)).all_true() && rest.iter().all(|v| v.is_finite())
 }
 
 /// Returns the maximum of `row` and `initial`.
@@ -421,6 +426,24 @@ mod tests {
     use super::*;
     use cv_synth::instruction_sets;
     use proptest::prelude::*;
+
+    #[test]
+    fn one_sample_that_is_not_finite_is_detected_anywhere() {
+        for width in 0..50 {
+            // The largest finite values: their sum would overflow.
+            let mut row: Vec<f32> = (0..width).map(|i| if i % 2 == 0 { f32::MAX } else { -f32::MAX }).collect();
+            for level in instruction_sets() {
+                assert!(all_finite(level, &row));
+                for x in 0..width {
+                    for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+                        let finite = std::mem::replace(&mut row[x], value);
+                        assert!(!all_finite(level, &row), "{value} at {x} of {width}");
+                        row[x] = finite;
+                    }
+                }
+            }
+        }
+    }
 
     proptest! {
         #[test]

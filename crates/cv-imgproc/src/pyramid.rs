@@ -3,6 +3,7 @@
 use crate::mirror::{mirror_ends, mirror_index};
 use crate::rows::for_rows_with;
 use cv_core::{Image, ImageView};
+use fearless_simd::{Level, dispatch};
 
 /// Computes the next coarser pyramid level, half the resolution (rounded up): smoothing by `[1 4 6 4 1]/16` along both axes, then
 /// subsampling by two from the top left (OpenCV's `pyrDown`).
@@ -11,26 +12,38 @@ use cv_core::{Image, ImageView};
 pub fn pyr_down<const C: usize>(view: ImageView<'_, f32, C>) -> Image<f32, C> {
     let (w, h) = view.size();
     let mut out = Image::new(w.div_ceil(2), h.div_ceil(2), [0.0; C]);
+    let level = Level::new();
     for_rows_with(
         &mut out,
         || vec![0.0f32; (w + 4) * C],
         |padded, y, row| {
-            let source = |d: isize| view.row(mirror_index(2 * y as isize + d, h));
-            let (a, b, c, d, e) = (source(-2), source(-1), source(0), source(1), source(2));
-            for (i, out) in padded[2 * C..(w + 2) * C].iter_mut().enumerate() {
-                *out = (a[i] + e[i]) + 4.0 * (b[i] + d[i]) + 6.0 * c[i];
-            }
+            let rows = [-2, -1, 0, 1, 2].map(|d| view.row(mirror_index(2 * y as isize + d, h)));
+            dispatch!(level, _simd => smooth_vertically(rows, &mut padded[2 * C..(w + 2) * C]));
             mirror_ends::<C>(padded, 2, 2);
-            for (x, out) in row.chunks_exact_mut(C).enumerate() {
-                let p = &padded[2 * x * C..(2 * x + 5) * C];
-                for (c, out) in out.iter_mut().enumerate() {
-                    *out =
-                        ((p[c] + p[4 * C + c]) + 4.0 * (p[C + c] + p[3 * C + c]) + 6.0 * p[2 * C + c]) * (1.0 / 256.0);
-                }
-            }
+            dispatch!(level, _simd => smooth_and_halve::<C>(padded, row));
         },
     );
     out
+}
+
+/// Filters a column of five pixels by `[1 4 6 4 1]`.
+#[inline(always)]
+fn smooth_vertically(rows: [&[f32]; 5], out: &mut [f32]) {
+    let [a, b, c, d, e] = rows.map(|row| &row[..out.len()]);
+    for (i, out) in out.iter_mut().enumerate() {
+        *out = (a[i] + e[i]) + 4.0 * (b[i] + d[i]) + 6.0 * c[i];
+    }
+}
+
+/// Filters every other pixel by `[1 4 6 4 1]/256`; `padded` has two more pixels at either end.
+#[inline(always)]
+fn smooth_and_halve<const C: usize>(padded: &[f32], out: &mut [f32]) {
+    for (x, out) in out.chunks_exact_mut(C).enumerate() {
+        let p = &padded[2 * x * C..(2 * x + 5) * C];
+        for (c, out) in out.iter_mut().enumerate() {
+            *out = ((p[c] + p[4 * C + c]) + 4.0 * (p[C + c] + p[3 * C + c]) + 6.0 * p[2 * C + c]) * (1.0 / 256.0);
+        }
+    }
 }
 
 /// Upsamples a pyramid level by two: zeros between the pixels, smoothed by `[1 4 6 4 1]/8` along both axes (OpenCV's `pyrUp`).

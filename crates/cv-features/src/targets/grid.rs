@@ -183,17 +183,21 @@ fn neighbors_of(
         candidates += usize::from(i != j);
         let (other, theirs) = (&corners[j], axes[j]);
         let d = other.position - corner.position;
-        let distance = d.norm();
-        if i == j || distance < (0.9 * corner.radius.min(other.radius)).max(3.0) {
+        let squared_distance = d.norm_squared();
+        // Most candidates are in other directions.
+        let across = own.map(|a| a.perp(&d).abs());
+        let axis = usize::from(across[1] < across[0]);
+        let limit = MAX_SINE_ALONG * MAX_SINE_ALONG * squared_distance;
+        let too_close = (0.9 * corner.radius.min(other.radius)).max(3.0);
+        if i == j || across[axis] * across[axis] >= limit || squared_distance < too_close * too_close {
             return candidates < MAX_CANDIDATES;
         }
-        let sine = own.map(|a| a.perp(&d).abs() / distance);
-        let axis = usize::from(sine[1] < sine[0]);
+        let distance = squared_distance.sqrt();
+        let sine = across[axis] / distance;
         let k = axis + if own[axis].dot(&d) < 0.0 { 2 } else { 0 };
-        let cost = distance * (1.0 + 4.0 * sine[axis] * sine[axis]);
+        let cost = distance * (1.0 + 4.0 * sine * sine);
         let mut now = best.get();
-        let is_neighbor = sine[axis] < MAX_SINE_ALONG
-            && now[k].is_none_or(|b| cost < b.0)
+        let is_neighbor = now[k].is_none_or(|b| cost < b.0)
             && theirs[1 - axis].perp(&d).abs() < MAX_SINE_ALONG * distance
             && theirs[axis].perp(&own[1 - axis]).abs() < MAX_SINE_ACROSS
             && other.contrast < 5.0 * corner.contrast

@@ -8,7 +8,7 @@
 
 use crate::simd;
 use cv_core::{ImageView, Point2};
-use fearless_simd::{Level, dispatch, prelude::*};
+use fearless_simd::{Level, dispatch, f32x8, prelude::*};
 
 /// A refined corner.
 #[derive(Debug, Clone, Copy)]
@@ -30,10 +30,15 @@ impl Saddle {
 /// Maximum number of iterations.
 const MAX_ITERATIONS: usize = 30;
 
-/// A window of interpolated intensities around a position: `side` × `side` samples with a spacing of a pixel.
+/// Number of samples that are processed at once.
+const LANES: usize = 8;
+
+/// A window of interpolated intensities around a position: `side` × `side` samples with a spacing of a pixel, in rows
+/// of `stride` values of which the last are zero: [`LANES`] at a time, up to two past each sample.
 struct Patch {
     values: Vec<f32>,
     side: usize,
+    stride: usize,
 }
 
 impl Patch {
@@ -51,13 +56,19 @@ impl Patch {
             return None;
         }
         let (fx, fy) = ((x0 - bx) as f32, (y0 - by) as f32);
-        self.values.clear();
-        for j in 0..self.side {
+        self.stride = self.side.next_multiple_of(LANES) + 2;
+        self.values.resize(self.side * self.stride, 0.0);
+        for (j, row) in self.values.chunks_exact_mut(self.stride).enumerate() {
             let (above, below) = (&view.row(iy + j)[ix..=ix + self.side], &view.row(iy + j + 1)[ix..=ix + self.side]);
-            for i in 0..self.side {
+            let row = &mut row[..self.side];
+            if (fx, fy) == (0.0, 0.0) {
+                row.copy_from_slice(&above[..self.side]);
+                continue;
+            }
+            for (i, value) in row.iter_mut().enumerate() {
                 let top = above[i] + fx * (above[i + 1] - above[i]);
                 let bottom = below[i] + fx * (below[i + 1] - below[i]);
-                self.values.push(top + fy * (bottom - top));
+                *value = top + fy * (bottom - top);
             }
         }
         Some(())
@@ -74,7 +85,8 @@ pub(crate) fn refine_saddle(
     tolerance: f64,
 ) -> Option<Saddle> {
     let radius = (1.25 * window.clamp(1.0, 64.0)).round() as usize;
-    let mut patch = Patch { values: Vec::new(), side: 0 };
+    let mut patch = Patch { values: Vec::new(), side: 0, stride: 0 };
+    let mut weights = [const { Vec::new() }; 2];
     let level = simd::level();
     let mut at = start;
     let mut center = Point2::new(f64::NAN, f64::NAN);
@@ -87,10 +99,12 @@ pub(crate) fn refine_saddle(
         }
         let off = at - center;
         // Biweights along each axis, similar to a Gaussian that is e⁻¹ at the radius, and zero at the window's border.
-        let weights = [off.x, off.y].map(|off| -> Vec<f32> {
+        for (weights, off) in weights.iter_mut().zip([off.x, off.y]) {
             let to = |i: usize| (i as f64 - radius as f64 - off) / (radius + 1) as f64;
-            (0..=2 * radius).map(|i| (1.0 - to(i).powi(2)).max(0.0).powi(2) as f32).collect()
-        });
+            weights.clear();
+            weights.extend((0..=2 * radius).map(|i| (1.0 - to(i).powi(2)).max(0.0).powi(2) as f32));
+            weights.resize((2 * radius + 1).next_multiple_of(LANES), 0.0);
+        }
         let normal = normal_equations(level, &patch, radius, &weights);
         let solution = normal.solve()?;
         let step = [solution[0] - off.x, solution[1] - off.y];
@@ -122,42 +136,40 @@ fn normal_equations(level: Level, patch: &Patch, radius: usize, weights: &[Vec<f
 }
 
 #[inline(always)]
-fn normal_equations_impl<S: Simd>(_: S, patch: &Patch, radius: usize, weights: &[Vec<f32>; 2]) -> NormalEquations {
-    let (side, n) = (patch.side, 2 * radius + 1);
-    let mut sums = [0.0f64; 5];
+fn normal_equations_impl<S: Simd>(simd: S, patch: &Patch, radius: usize, weights: &[Vec<f32>; 2]) -> NormalEquations {
+    let (stride, n) = (patch.stride, 2 * radius + 1);
+    // The sums of each lane, in an order that does not depend on the machine.
+    let mut sums = [[0.0f64; LANES]; 5];
+    let offsets = f32x8::from_slice(simd, &[0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]) - radius as f32;
     for j in 0..n {
-        let row = &patch.values[(j + 1) * side..][..side];
-        let above = &patch.values[j * side + 1..][..n];
-        let below = &patch.values[(j + 2) * side + 1..][..n];
-        let (left, right) = (&row[..n], &row[2..][..n]);
+        let [above, row, below] = [0, 1, 2].map(|k| &patch.values[(j + k) * stride..][..stride]);
         let y = j as f32 - radius as f32;
-        // Eight partial sums each, in an order that does not depend on the machine.
-        let mut lanes = [[0.0f32; 8]; 5];
-        for start in (0..n).step_by(8) {
-            let count = (n - start).min(8);
-            let mut gx = [0.0f32; 8];
-            let mut gy = [0.0f32; 8];
-            let mut w = [0.0f32; 8];
-            for i in 0..count {
-                gx[i] = right[start + i] - left[start + i];
-                gy[i] = below[start + i] - above[start + i];
-                w[i] = weights[0][start + i] * weights[1][j];
-            }
-            for i in 0..8 {
-                let x = (start + i) as f32 - radius as f32;
-                let (xx, xy, yy) = (w[i] * gx[i] * gx[i], w[i] * gx[i] * gy[i], w[i] * gy[i] * gy[i]);
-                lanes[0][i] += xx;
-                lanes[1][i] += xy;
-                lanes[2][i] += yy;
-                lanes[3][i] += xx * x + xy * y;
-                lanes[4][i] += xy * x + yy * y;
-            }
+        let mut row_sums = [f32x8::splat(simd, 0.0); 5];
+        for (start, weights_x) in (0..n).step_by(LANES).zip(weights[0].chunks_exact(LANES)) {
+            let gx =
+                f32x8::from_slice(simd, &row[start + 2..][..LANES]) - f32x8::from_slice(simd, &row[start..][..LANES]);
+            let gy = f32x8::from_slice(simd, &below[start + 1..][..LANES])
+                - f32x8::from_slice(simd, &above[start + 1..][..LANES]);
+            // Zero after the last sample.
+            let w = f32x8::from_slice(simd, weights_x) * weights[1][j];
+            let x = offsets + start as f32;
+            let wx = w * gx;
+            let (xx, xy, yy) = (wx * gx, wx * gy, w * gy * gy);
+            row_sums[0] += xx;
+            row_sums[1] += xy;
+            row_sums[2] += yy;
+            row_sums[3] += xx * x + xy * y;
+            row_sums[4] += xy * x + yy * y;
         }
-        for (sum, lanes) in sums.iter_mut().zip(&lanes) {
-            *sum += lanes.iter().map(|&v| f64::from(v)).sum::<f64>();
+        for (sum, row_sum) in sums.iter_mut().zip(&row_sums) {
+            let mut lanes = [0.0f32; LANES];
+            row_sum.store_slice(&mut lanes);
+            for i in 0..LANES {
+                sum[i] += f64::from(lanes[i]);
+            }
         }
     }
-    let [xx, xy, yy, bx, by] = sums;
+    let [xx, xy, yy, bx, by] = sums.map(|lanes| lanes.iter().sum());
     NormalEquations { xx, xy, yy, bx, by }
 }
 
@@ -175,9 +187,13 @@ impl NormalEquations {
     /// the window and itself rotated by 180°, under which an X-corner is symmetric; then the Cramér–Rao bound, σ²·(Σ
     /// g·gᵀ)⁻¹.
     fn deviation(&self, patch: &Patch) -> f64 {
-        let n = patch.values.len();
-        let sum: f64 = (0..n / 2).map(|i| f64::from(patch.values[i] - patch.values[n - 1 - i]).powi(2)).sum();
-        let variance = sum / (2.0 * (n / 2).max(1) as f64);
+        let (side, rows) = (patch.side, patch.values.chunks_exact(patch.stride));
+        // Every difference twice.
+        let difference = |(a, b): (&f32, &f32)| f64::from(a - b).powi(2);
+        let rotated = rows.clone().rev().map(|row| row[..side].iter().rev());
+        let sum: f64 =
+            rows.zip(rotated).map(|(row, other)| row[..side].iter().zip(other).map(difference).sum::<f64>()).sum();
+        let variance = 0.5 * sum / (2.0 * (side * side / 2).max(1) as f64);
         let det = self.xx * self.yy - self.xy * self.xy;
         // Gradients are differences over two pixels, twice the derivative.
         (variance * 4.0 * 0.5 * (self.xx + self.yy) / det).sqrt()

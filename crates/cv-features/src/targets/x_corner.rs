@@ -304,17 +304,18 @@ pub(crate) fn edge_directions(values: &[f32; 16], angle: impl Fn(usize) -> f64) 
 
 /// Removes duplicates of several octaves: keeps the corner with the highest contrast, with a preference for finer
 /// octaves, which are more accurate.
-fn remove_duplicates(mut corners: Vec<XCorner>) -> Vec<XCorner> {
+fn remove_duplicates(corners: Vec<XCorner>) -> Vec<XCorner> {
     // A preference of 15 % per octave.
     let priority = |c: &XCorner| c.contrast * (c.radius as f32).powf(-0.23);
-    corners.sort_by(|a, b| {
-        let by = priority(b).total_cmp(&priority(a)).then(a.position.y.total_cmp(&b.position.y));
+    let mut corners: Vec<(f32, XCorner)> = corners.into_iter().map(|c| (priority(&c), c)).collect();
+    corners.sort_by(|(p, a), (q, b)| {
+        let by = q.total_cmp(p).then(a.position.y.total_cmp(&b.position.y));
         by.then(a.position.x.total_cmp(&b.position.x))
     });
     let mut unique: Vec<XCorner> = Vec::new();
     let mut cells: std::collections::HashMap<(i64, i64), Vec<usize>> = std::collections::HashMap::new();
     const CELL: f64 = 24.0;
-    for corner in corners {
+    for (_, corner) in corners {
         let cell = |v: f64| (v / CELL).floor() as i64;
         let (x, y) = (cell(corner.position.x), cell(corner.position.y));
         // Squares are larger than the smaller ring, and the position of the larger one is less accurate.
