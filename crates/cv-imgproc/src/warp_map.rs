@@ -11,12 +11,14 @@ use crate::sample::{bilinear_at, split_coordinate};
 use crate::{Pixel, WarpError, simd};
 use cv_core::{Image, ImageView, Mask, Point2};
 use cv_parallel::prelude::*;
-use fearless_simd::{Level, dispatch, i16x16, prelude::*, u8x16, u8x32, u16x16, u32x8};
+use fearless_simd::{Level, dispatch, i16x32, prelude::*, u8x16, u8x64, u16x32, u32x16};
 
 /// Result pixels per block.
 const LANES: usize = 8;
 /// Bytes per window.
 const WINDOW_BYTES: usize = 16;
+/// Blocks that are interpolated at once: their windows fill a vector.
+const BLOCKS: usize = 4;
 /// Channels of RGB, and parts of eight samples of an RGB block. Windows are used for RGB and gray images.
 const RGB_CHANNELS: usize = 3;
 /// Maximum row step of blocks that use windows: a rotation by 90° steps by one row per pixel.
@@ -299,20 +301,22 @@ impl WarpMap {
         if windows && frame.height() > 0 {
             prefetch(frame, blocks);
         }
-        // Two blocks at a time; the end of a row by itself.
-        for (pair, out) in blocks.chunks(2).zip(out.chunks_mut(2 * LANES * C)) {
-            match pair {
-                [one, two] if out.len() == 2 * LANES * C && is_simple(one) && is_simple(two) => {
-                    let pair = [one, two].map(|block| (block, SourceRows::new(frame, block)));
-                    let (first, second) = out.split_at_mut(LANES * C);
-                    let parts = first.as_chunks_mut::<LANES>().0.iter_mut().zip(second.as_chunks_mut::<LANES>().0);
-                    for ((part, (first, second)), pattern) in parts.enumerate().zip(&patterns) {
-                        (*first, *second) = interpolate_block_pair(simd, frame, &pair, (part, pattern));
+        // Four blocks at a time; the end of a row by itself.
+        for (four, out) in blocks.chunks(BLOCKS).zip(out.chunks_mut(BLOCKS * LANES * C)) {
+            match <&[Block; BLOCKS]>::try_from(four) {
+                Ok(four) if out.len() == BLOCKS * LANES * C && four.iter().all(is_simple) => {
+                    let rows = four.each_ref().map(|block| SourceRows::new(frame, block));
+                    for (part, pattern) in patterns.iter().enumerate().take(C) {
+                        let bytes = interpolate_four_blocks(simd, frame, (four, &rows), (part, pattern));
+                        for (k, out) in out.chunks_exact_mut(LANES * C).enumerate() {
+                            out[part * LANES..(part + 1) * LANES].copy_from_slice(&bytes[k * LANES..(k + 1) * LANES]);
+                        }
                     }
-                    clear_outside::<C>(one, first);
-                    clear_outside::<C>(two, second);
+                    for (block, out) in four.iter().zip(out.chunks_exact_mut(LANES * C)) {
+                        clear_outside::<C>(block, out);
+                    }
                 }
-                _ => self.interpolate_blocks(frame, pair, out),
+                _ => self.interpolate_blocks(frame, four, out),
             }
         }
     }
@@ -452,15 +456,15 @@ fn interpolate_bytes<const C: usize>(
     std::array::from_fn(|c| ((along(above, c) * (256 - fy) + along(below, c) * fy + (1 << 15)) >> 16) as u8)
 }
 
-/// Shuffle indices that expand per-pixel values of two blocks to eight samples of each.
+/// Shuffle indices that expand per-pixel values of four blocks to eight samples of each.
 #[derive(Clone, Copy)]
 struct ShufflePattern<S: Simd> {
     /// For each sample twice: its pixel.
-    columns: u8x32<S>,
+    columns: u8x64<S>,
     /// Likewise, for fractions in the upper half.
-    fractions: u8x32<S>,
+    fractions: u8x64<S>,
     /// Its channel, and the same channel of the right neighbor.
-    channel: u8x32<S>,
+    channel: u8x64<S>,
 }
 
 impl<S: Simd> ShufflePattern<S> {
@@ -470,8 +474,8 @@ impl<S: Simd> ShufflePattern<S> {
         let part = part.min(channels.max(1) - 1);
         let sample = |i: usize| LANES * part + i / 2;
         let of = |f: &dyn Fn(usize) -> usize| {
-            let bytes: [u8; 2 * WINDOW_BYTES] = std::array::from_fn(|i| f(i % WINDOW_BYTES) as u8);
-            u8x32::from_slice(simd, &bytes)
+            let bytes: [u8; BLOCKS * WINDOW_BYTES] = std::array::from_fn(|i| f(i % WINDOW_BYTES) as u8);
+            u8x64::from_slice(simd, &bytes)
         };
         Self {
             columns: of(&|i| sample(i) / channels),
@@ -492,76 +496,100 @@ impl<'a> SourceRows<'a> {
     }
 }
 
-/// Interpolates eight samples of each of two blocks that fit into windows, with the same results as [`interpolate_bytes`].
+/// Loads a window of each of four byte strings.
 #[inline(always)]
-fn interpolate_block_pair<S: Simd, const C: usize>(
+fn load_windows<S: Simd>(simd: S, bytes: [&[u8]; BLOCKS], starts: [usize; BLOCKS]) -> u8x64<S> {
+    let a = u8x16::from_slice(simd, &bytes[0][starts[0]..starts[0] + WINDOW_BYTES]);
+    let b = u8x16::from_slice(simd, &bytes[1][starts[1]..starts[1] + WINDOW_BYTES]);
+    let c = u8x16::from_slice(simd, &bytes[2][starts[2]..starts[2] + WINDOW_BYTES]);
+    let d = u8x16::from_slice(simd, &bytes[3][starts[3]..starts[3] + WINDOW_BYTES]);
+    a.combine(b).combine(c.combine(d))
+}
+
+/// Interpolates along a row: pairs of bytes, left and right, by the fractions in 1/256. The result is at most 255 · 256 and fits
+/// an i16 after subtracting 32768; sums and products wrap.
+#[inline(always)]
+fn along<S: Simd>(pairs: u8x64<S>, fx: u16x32<S>) -> u32x16<S> {
+    let pairs: u16x32<S> = pairs.bitcast();
+    let (left, right) = (pairs & 255, pairs >> 8);
+    (((left << 8) + fx * (right - left)) ^ (1 << 15)).bitcast()
+}
+
+/// Interpolates between 16-bit samples of two rows, the even or the odd ones of `a` and `b`: each pair of values with its weights.
+/// The weights sum to 256: adds back 256 · 32768, and rounds. The result is in the upper half.
+#[inline(always)]
+fn weighted_sum<S: Simd>(values: u32x16<S>, weights: u32x16<S>) -> u32x16<S> {
+    let (values, weights): (i16x32<S>, i16x32<S>) = (values.bitcast(), weights.bitcast());
+    (values.pairwise_dot_product(weights) + ((1 << 23) + (1 << 15))).bitcast()
+}
+
+/// Interpolates eight samples of each of four blocks that fit into windows, with the same results as [`interpolate_bytes`].
+#[inline(always)]
+fn interpolate_four_blocks<S: Simd, const C: usize>(
     simd: S,
     frame: ImageView<'_, u8, C>,
-    pair: &[(&Block, SourceRows<'_>); 2],
+    (blocks, rows): (&[Block; BLOCKS], &[SourceRows<'_>; BLOCKS]),
     (part, pattern): (usize, &ShufflePattern<S>),
-) -> ([u8; LANES], [u8; LANES]) {
-    let [one, two] = pair;
-    let length = frame.width() * C;
-    let first = |block: &Block| C * block.x as usize;
+) -> [u8; BLOCKS * LANES] {
     // The window must not exceed the row; samples are then at larger offsets in it.
-    let start = |block: &Block| (first(block) + C * block.window_step(part, C)).min(length - WINDOW_BYTES);
-    let starts = [start(one.0), start(two.0)];
-    let both = |a: &[u8], b: &[u8]| u8x16::from_slice(simd, a).combine(u8x16::from_slice(simd, b));
+    let last_start = frame.width() * C - WINDOW_BYTES;
+    let (mut starts, mut shifts) = ([0; BLOCKS], [0; BLOCKS]);
+    for (k, block) in blocks.iter().enumerate() {
+        let first = C * block.x as usize;
+        starts[k] = (first + C * block.window_step(part, C)).min(last_start);
+        // Differences modulo 256.
+        shifts[k] = starts[k].wrapping_sub(first) as u8;
+    }
+    let [a, b, c, d] = shifts;
+    let shifts = u8x16::splat(simd, a).combine(u8x16::splat(simd, b));
+    let shifts = shifts.combine(u8x16::splat(simd, c).combine(u8x16::splat(simd, d)));
+    let numbers = [
+        &blocks[0].steps_and_fractions[..],
+        &blocks[1].steps_and_fractions[..],
+        &blocks[2].steps_and_fractions[..],
+        &blocks[3].steps_and_fractions[..],
+    ];
     // Steps and fractions in x; fractions in x and in y.
-    let numbers = |i: usize| {
-        both(&one.0.steps_and_fractions[i..i + WINDOW_BYTES], &two.0.steps_and_fractions[i..i + WINDOW_BYTES])
-    };
-    let (front, back) = (numbers(0), numbers(LANES));
+    let front = load_windows(simd, numbers, [0; BLOCKS]);
+    let back = load_windows(simd, numbers, [LANES; BLOCKS]);
     let steps = front.swizzle_dyn_within_blocks(pattern.columns);
     let (columns, row_steps) = (steps & 15, steps >> 4);
     let mut index = pattern.channel;
     for _ in 0..C {
         index += columns;
     }
-    // Differences modulo 256.
-    let window_shift = |k: usize, block: &Block| u8x16::splat(simd, starts[k].wrapping_sub(first(block)) as u8);
-    index -= window_shift(0, one.0).combine(window_shift(1, two.0));
-    let window = |a: &[u8], b: &[u8]| -> u8x32<S> {
-        let windows = both(&a[starts[0]..starts[0] + WINDOW_BYTES], &b[starts[1]..starts[1] + WINDOW_BYTES]);
-        windows.swizzle_dyn_within_blocks(index)
-    };
+    index -= shifts;
     // At least two rows, most often three: always three, without an unpredictable branch.
-    let row_window = |i: usize| window(one.1.0[i], two.1.0[i]);
-    let (upper, middle, mut below) = (row_window(0), row_window(1), row_window(2));
-    let reached = row_steps.simd_ge(u8x32::splat(simd, 1));
+    let [a, b, c, d] = rows;
+    let upper = load_windows(simd, [a.0[0], b.0[0], c.0[0], d.0[0]], starts).swizzle_dyn_within_blocks(index);
+    let middle = load_windows(simd, [a.0[1], b.0[1], c.0[1], d.0[1]], starts).swizzle_dyn_within_blocks(index);
+    let mut below = load_windows(simd, [a.0[2], b.0[2], c.0[2], d.0[2]], starts).swizzle_dyn_within_blocks(index);
+    let reached = row_steps.simd_ge(u8x64::splat(simd, 1));
     let (mut top, mut bottom) = (reached.select(middle, upper), reached.select(below, middle));
-    for row in 2..=one.0.rows.max(two.0.rows) {
-        let at = |block: &Block| frame.row((block.y as usize + 1 + usize::from(row)).min(frame.height() - 1));
+    let last = blocks[0].rows.max(blocks[1].rows).max(blocks[2].rows.max(blocks[3].rows));
+    for row in 2..=last {
+        let mut windows: [&[u8]; BLOCKS] = [&[]; BLOCKS];
+        for (window, block) in windows.iter_mut().zip(blocks) {
+            *window = frame.row((block.y as usize + 1 + usize::from(row)).min(frame.height() - 1));
+        }
         let above = below;
-        below = window(at(one.0), at(two.0));
-        let reached = row_steps.simd_ge(u8x32::splat(simd, row));
+        below = load_windows(simd, windows, starts).swizzle_dyn_within_blocks(index);
+        let reached = row_steps.simd_ge(u8x64::splat(simd, row));
         top = reached.select(above, top);
         bottom = reached.select(below, bottom);
     }
-    let fraction = |numbers: u8x32<S>| -> u16x16<S> {
-        let twice: u16x16<S> = numbers.swizzle_dyn_within_blocks(pattern.fractions).bitcast();
-        twice & 255
-    };
-    let (fx, fy) = (fraction(front), fraction(back));
-    let along = |pairs: u8x32<S>| -> u32x8<S> {
-        // Bytes of a lane: left, right. Sums and products wrap; the result is at most 255 · 256, and fits an i16 after subtracting 32768.
-        let pairs: u16x16<S> = pairs.bitcast();
-        let (left, right) = (pairs & 255, pairs >> 8);
-        (((left << 8) + fx * (right - left)) ^ (1 << 15)).bitcast()
-    };
-    // Interleaves two rows of 16-bit samples: pairs of even samples, and of odd ones.
-    let paired = |a: u32x8<S>, b: u32x8<S>| -> [i16x16<S>; 2] {
-        [((a & 0xFFFF) | (b << 16)).bitcast(), ((a >> 16) | (b & 0xFFFF_0000)).bitcast()]
-    };
-    let values = paired(along(top), along(bottom));
-    let weights = paired((u16x16::splat(simd, 256) - fy).bitcast(), fy.bitcast());
-    // The weights sum to 256: add back 256 · 32768, and round. The result is in the upper half.
-    let sum =
-        |i: usize| -> u32x8<S> { (values[i].pairwise_dot_product(weights[i]) + ((1 << 23) + (1 << 15))).bitcast() };
-    let words: u16x16<S> = ((sum(0) >> 16) | (sum(1) & 0xFFFF_0000)).bitcast();
+    let fx = front.swizzle_dyn_within_blocks(pattern.fractions).bitcast::<u16x32<S>>() & 255;
+    let fy = back.swizzle_dyn_within_blocks(pattern.fractions).bitcast::<u16x32<S>>() & 255;
+    let (top, bottom) = (along(top, fx), along(bottom, fx));
+    let (above, below): (u32x16<S>, u32x16<S>) = ((u16x32::splat(simd, 256) - fy).bitcast(), fy.bitcast());
+    // The two rows interleaved: pairs of even samples, and of odd ones.
+    let even = weighted_sum((top & 0xFFFF) | (bottom << 16), (above & 0xFFFF) | (below << 16));
+    let odd = weighted_sum((top >> 16) | (bottom & 0xFFFF_0000), (above >> 16) | (below & 0xFFFF_0000));
+    let words: u16x32<S> = ((even >> 16) | (odd & 0xFFFF_0000)).bitcast();
     let (low, high) = words.split();
-    let bytes = low.narrow(high);
-    (std::array::from_fn(|i| bytes[i]), std::array::from_fn(|i| bytes[LANES + i]))
+    let mut bytes = [0; BLOCKS * LANES];
+    low.narrow(high).store_slice(&mut bytes);
+    bytes
 }
 
 #[cfg(test)]
