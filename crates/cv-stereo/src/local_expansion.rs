@@ -16,8 +16,14 @@ use cv_parallel::prelude::*;
 use fearless_simd::Level;
 
 /// Passes at coarser levels, where large cells have fewer pixels, and at full resolution.
-const COARSE: [Pass; 2] = [Pass { cell: 60, ransac: 3, perturbed: 0 }, Pass { cell: 30, ransac: 2, perturbed: 0 }];
-const FINE: [Pass; 2] = [Pass { cell: 24, ransac: 2, perturbed: 1 }, Pass { cell: MIN_CELL, ransac: 0, perturbed: 2 }];
+const COARSE: [Pass; 2] =
+    [Pass { cell: 60, ransac: 3, sloped: 0, perturbed: 0 }, Pass { cell: 30, ransac: 2, sloped: 0, perturbed: 0 }];
+/// In larger cells, sloped planes spread over textureless walls. Without them 3.7 % of the errors of Middlebury's Teddy are above 2 px in
+/// place of 2.3.
+const FINE: [Pass; 2] = [
+    Pass { cell: 24, ransac: 2, sloped: 0, perturbed: 1 },
+    Pass { cell: MIN_CELL, ransac: 0, sloped: 4, perturbed: 2 },
+];
 /// Side in px of the smallest cells, which the initial planes are fitted to.
 const MIN_CELL: usize = 10;
 
@@ -276,6 +282,21 @@ mod tests {
         let right = inside.iter().filter(|&&i| (map[i] - truth(i % SIZE.0, i / SIZE.0)).abs() < 0.5).count();
         // All but pixels that a cell at the border of the textureless part may keep.
         assert!(right * 100 >= inside.len() * 98, "{right} of {}", inside.len());
+    }
+
+    #[test]
+    fn a_table_at_a_grazing_angle_gets_its_slope() {
+        // The lowest 30 rows, by a pixel per row; the map continues the wall.
+        let is_table = |y: usize| y >= 160;
+        let truth = |_: usize, y: usize| 6.0 + if is_table(y) { y as f32 - 160.0 } else { 0.0 };
+        let pair = pair(truth, |x, _, y| texture(x, y));
+        let start = |_, y| is_table(y).then_some((6.0, PixelState::Mismatched));
+        let (map, _) = expanded(&pair, truth, start, &Silent).unwrap();
+        // The table's last row has disparity 35: to the left of that it is out of view.
+        let table = pixels_where(|x, y| is_table(y) && x >= 40);
+        let right = table.iter().filter(|&&i| (map[i] - truth(0, i / SIZE.0)).abs() < 0.5).count();
+        // Slopes are random: not every cell has the right one. Without them 4 % are right.
+        assert!(right * 2 >= table.len(), "{right} of {}", table.len());
     }
 
     #[test]

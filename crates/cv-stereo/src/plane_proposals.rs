@@ -1,5 +1,5 @@
-//! Plane proposals of a region: planes of its pixels, planes fitted to them, RANSAC planes of matches, and perturbed planes (Taniai et al.
-//! 2018, section 4).
+//! Plane proposals of a region: planes of its pixels, planes fitted to them, RANSAC planes of matches, planes of other slopes, and perturbed
+//! planes (Taniai et al. 2018, section 4).
 
 use crate::PixelState;
 use crate::expansion_region::{Labels, Problem, Region, Scratch, pixels};
@@ -24,8 +24,9 @@ const PERTURBATION: (f32, f32) = (1.0, 0.1);
 pub(crate) struct Pass {
     /// Side of a cell in px.
     pub(crate) cell: usize,
-    /// Number of RANSAC planes and of perturbed planes.
+    /// Number of RANSAC planes, of planes with a random vertical slope, and of perturbed planes.
     pub(crate) ransac: usize,
+    pub(crate) sloped: usize,
     pub(crate) perturbed: usize,
 }
 
@@ -85,6 +86,14 @@ pub(crate) fn propose_planes(
         if let Some(plane) = ransac_plane(problem, place, pass.cell, center, &mut random) {
             region.expand(problem, plane, scratch, stage)?;
         }
+    }
+    for _ in 0..pass.sloped {
+        // Through a pixel of the region. A floor or table at a grazing angle is steep, and has few matches.
+        let (x, y) = (place.left + random.below(place.width()), place.top + random.below(place.height()));
+        let plane = region.plane(x, y);
+        let (a, b) = (plane[0], MAX_SLOPE.1 * random.signed());
+        let c = at(plane, x, y) - a * x as f32 - b * y as f32;
+        region.expand(problem, [a, b, c], scratch, stage)?;
     }
     for n in 0..pass.perturbed {
         let [a, b, c] = any_plane(&region, &own, &mut random);
