@@ -27,6 +27,18 @@ struct PairInfo {
     min: i32,
 }
 
+/// Target of bad-2.0 in percent of the visible pixels in quality mode.
+const QUALITY_TARGETS: [(&str, f64); 8] = [
+    ("m3q-teddy", 2.0),
+    ("m3q-jadeplant", 9.0),
+    ("m3q-pipes", 4.5),
+    ("m3q-playtable", 5.5),
+    ("m3q-playtablep", 3.5),
+    ("m3q-motorcyclee", 2.8),
+    ("m3q-vintage", 12.0),
+    ("m2t-midd1", 20.0),
+];
+
 /// A pair with its ground truth, and the mask of the pixels visible in both views.
 struct Pair {
     name: String,
@@ -79,12 +91,15 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
         .map(|line| serde_json::from_str(line).with_context(|| line.to_owned()))
         .collect::<Result<_>>()?;
     let mut groups: BTreeMap<String, Vec<(String, Ours)>> = BTreeMap::new();
+    let mut in_quality_mode = Vec::new();
     for pair in read_pairs(data)? {
-        let ours = score(&pair)?;
+        let ours = score(&pair, false)?;
+        let quality = score(&pair, true)?;
         println!(
-            "{:22} {:5.2} % of the pixels visible in both views, {:5.2} % of all",
-            pair.name, ours.visible, ours.all
+            "{:22} {:5.2} % of the pixels visible in both views, {:5.2} % of all; in quality mode {:5.2} %",
+            pair.name, ours.visible, ours.all, quality.visible
         );
+        in_quality_mode.push((pair.name.clone(), pair.info.group.clone(), quality));
         groups.entry(pair.info.group).or_default().push((pair.name, ours));
     }
     let best = |scene: &str, opencv: bool, figure: fn(&Line) -> f64| {
@@ -129,9 +144,49 @@ pub(crate) fn run(python: &Path, data: &Path) -> Result<Vec<Check>> {
         }
         row(&mut text, &format!("**{group}**, mean"), &sum, "", "");
     }
+    checks.extend(write_quality_mode(&in_quality_mode, &mut text));
     print!("{text}");
     super::write_section("Stereo by group", &text)?;
     Ok(checks)
+}
+
+/// Appends the table of the quality mode; returns the checks of its targets.
+fn write_quality_mode(pairs: &[(String, String, Ours)], text: &mut String) -> Vec<Check> {
+    text.push_str(
+        "\nThe quality mode (`--quality`), bad-2.0 of the visible pixels and of all, and the other figures as above; the target is that of the visible pixels.\n\n\
+         | pair | visible (all) | target | bad-0.5 | D1 |\n|---|---|---|---|---|\n",
+    );
+    let mean = |group: &str, figure: fn(&Ours) -> f64| {
+        let of_group: Vec<f64> = pairs.iter().filter(|pair| pair.1 == group).map(|pair| figure(&pair.2)).collect();
+        of_group.iter().sum::<f64>() / of_group.len() as f64
+    };
+    let mut checks = Vec::new();
+    for (name, _, ours) in pairs {
+        let target = QUALITY_TARGETS.iter().find(|(pair, _)| pair == name).map(|target| target.1);
+        checks.extend(
+            target.map(|target| Check::at_most(format!("quality mode, {name} bad-2.0 %"), ours.visible, target)),
+        );
+        let target = target.map_or_else(String::new, |target| format!("{target:.1}"));
+        // `fmt::Write` on a String cannot fail.
+        let _ = writeln!(
+            text,
+            "| {name} | {:.2} ({:.1}) | {target} | {:.1} | {:.1} |",
+            ours.visible, ours.all, ours.bad_half, ours.d1
+        );
+    }
+    let mut separator = "\nMeans: ";
+    for (group, figure, of, target) in [
+        ("midd3q", "bad-0.5", (|ours: &Ours| ours.bad_half) as fn(&Ours) -> f64, 14.0),
+        ("drivingstereo", "bad-2.0", |ours| ours.visible, 4.5),
+        ("drivingstereo", "D1", |ours| ours.d1, 2.0),
+    ] {
+        let measured = mean(group, of);
+        let _ = write!(text, "{separator}{group} {figure} {measured:.2} (target {target:.1})");
+        separator = "; ";
+        checks.push(Check::at_most(format!("quality mode, {group} mean {figure} %"), measured, target));
+    }
+    text.push_str(".\n");
+    checks
 }
 
 fn row(text: &mut String, name: &str, ours: &Ours, opencv: &str, pandora: &str) {
@@ -179,10 +234,10 @@ fn read_pairs(data: &Path) -> Result<Vec<Pair>> {
     Ok(pairs)
 }
 
-/// Scores our `depth` on a pair, with default options but for the disparity range.
-fn score(pair: &Pair) -> Result<Ours> {
+/// Scores our `depth` on a pair, with default options but for the disparity range and the mode.
+fn score(pair: &Pair, quality: bool) -> Result<Ours> {
     let PairInfo { disparities, min, .. } = pair.info;
-    let stereo = StereoOptions { disparities, min_disparity: min, ..Default::default() };
+    let stereo = StereoOptions { disparities, min_disparity: min, quality, ..Default::default() };
     let options = DepthOptions { stereo, ..Default::default() };
     let map = depth(pair.photos[0].view(), pair.photos[1].view(), None, &options, &Silent)?.map;
     let [mut bad_half, mut visible, mut all, mut d1, mut matched, mut occluded, mut out_of_view] =
