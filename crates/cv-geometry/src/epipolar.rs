@@ -1,7 +1,7 @@
 //! The Sampson error of epipolar geometry, and refinement by minimizing it.
 
-use crate::match_blocks::{Halves, LANES, MatchBlock, PairBlocks, add_halves, sum_lanes};
-use crate::ransac::Scorer;
+use crate::match_blocks::{Halves, LANES, MatchBlock, PairBlocks, sum_lanes};
+use crate::ransac::{BlockLosses, Scorer};
 use cv_core::{Correspondence, Matrix3, Vector3};
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
 use fearless_simd::{Level, dispatch, f64x8, prelude::*};
@@ -43,11 +43,7 @@ impl<'a, M: Epipolar<N>, const N: usize> SampsonProblem<'a, M, N> {
         let (u_first, u_second) = u.split_at_mut(LANES / 2);
         (first.c * first.c * first.inverse * inverse_threshold2).store_slice(u_first);
         (second.c * second.c * second.inverse * inverse_threshold2).store_slice(u_second);
-        // Padding lanes have a loss of 1.
-        u[count..].fill(f64::NAN);
-        let (mut losses, mut weights) = ([0.0; LANES], [0.0; LANES]);
-        self.scorer.losses_and_weights(&u, &mut losses, &mut weights);
-        Terms { halves: [first, second], losses, weights }
+        Terms { halves: [first, second], losses: BlockLosses::new(self.scorer, u, count) }
     }
 
     /// Computes the cost.
@@ -57,7 +53,7 @@ impl<'a, M: Epipolar<N>, const N: usize> SampsonProblem<'a, M, N> {
         let mut cost = f64x8::splat(simd, 0.0);
         for (block, count) in self.pairs.iter() {
             let terms = self.terms(simd, &f, block, count);
-            cost += add_halves(simd, &terms.losses);
+            cost += terms.losses.sum(simd);
         }
         sum_lanes(cost) - self.pairs.padding() as f64
     }
@@ -70,9 +66,9 @@ impl<'a, M: Epipolar<N>, const N: usize> SampsonProblem<'a, M, N> {
         let (mut cost, mut hessian, mut gradient) = (zero, [[zero; 9]; 9], [zero; 9]);
         for (block, count) in self.pairs.iter() {
             let terms = self.terms(simd, &f, block, count);
-            cost += add_halves(simd, &terms.losses);
+            cost += terms.losses.sum(simd);
             for (half, TermsHalf { pair: [x, y, s, t], l, m, c, inverse }) in terms.halves.into_iter().enumerate() {
-                let weight = f64x8::from_slice(simd, &terms.weights[half * LANES / 2..][..LANES / 2]);
+                let weight = terms.losses.weights(simd, half);
                 // Terms beyond the cutoff may be infinite or NaN, which a weight of 0 does not remove.
                 let is_unused = weight.simd_eq(zero);
                 // r = C/√D: ∂r = (∂C − C ∂D/(2D))/√D; ∂D/2 = l ∂l + m ∂m.
@@ -103,8 +99,7 @@ impl<'a, M: Epipolar<N>, const N: usize> SampsonProblem<'a, M, N> {
 /// The terms of a block of pairs.
 struct Terms<S: Simd> {
     halves: [TermsHalf<S>; 2],
-    losses: [f64; LANES],
-    weights: [f64; LANES],
+    losses: BlockLosses,
 }
 
 /// The pairs, the first two entries of `F a` and of `Fᵀ b`, `C = bᵀ F a`, and `1/D` (D the sum of the squares of the

@@ -85,13 +85,6 @@ impl PairBlocks {
     }
 }
 
-/// Adds the halves of a block.
-#[inline(always)]
-pub(crate) fn add_halves<S: Simd>(simd: S, values: &[f64; LANES]) -> f64x8<S> {
-    let (first, second) = values.split_at(LANES / 2);
-    f64x8::from_slice(simd, first) + f64x8::from_slice(simd, second)
-}
-
 /// Sums the lanes pairwise, in a fixed order.
 #[inline(always)]
 pub(crate) fn sum_lanes<S: Simd>(lanes: f64x8<S>) -> f64 {

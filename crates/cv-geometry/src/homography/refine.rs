@@ -1,7 +1,7 @@
 //! Refinement of a homography on the symmetric transfer error.
 
-use crate::match_blocks::{Halves, LANES, PairBlocks, add_halves, sum_lanes};
-use crate::ransac::Scorer;
+use crate::match_blocks::{Halves, LANES, PairBlocks, sum_lanes};
+use crate::ransac::{BlockLosses, Scorer};
 use cv_core::Matrix3;
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
 use fearless_simd::{Level, dispatch, f64x8, prelude::*};
@@ -96,11 +96,7 @@ impl TransferProblem<'_> {
         let (u_first, u_second) = u.split_at_mut(LANES / 2);
         (first.squared_distances() * scale).store_slice(u_first);
         (second.squared_distances() * scale).store_slice(u_second);
-        // Padding lanes have a loss of 1.
-        u[count..].fill(f64::NAN);
-        let (mut losses, mut weights) = ([0.0; LANES], [0.0; LANES]);
-        self.scorer.losses_and_weights(&u, &mut losses, &mut weights);
-        Terms { halves: [first, second], losses, weights }
+        Terms { halves: [first, second], losses: BlockLosses::new(self.scorer, u, count) }
     }
 
     /// Computes the cost.
@@ -108,7 +104,7 @@ impl TransferProblem<'_> {
     fn sum<S: Simd>(&self, simd: S, h: &[f64; 9], g: &[f64; 9]) -> f64 {
         let mut cost = f64x8::splat(simd, 0.0);
         for (block, count) in self.pairs.iter() {
-            cost += add_halves(simd, &self.terms(simd, h, g, block, count).losses);
+            cost += self.terms(simd, h, g, block, count).losses.sum(simd);
         }
         sum_lanes(cost) - self.pairs.padding() as f64
     }
@@ -120,9 +116,9 @@ impl TransferProblem<'_> {
         let mut cost = f64x8::splat(simd, 0.0);
         for (block, count) in self.pairs.iter() {
             let terms = self.terms(simd, h, g, block, count);
-            cost += add_halves(simd, &terms.losses);
+            cost += terms.losses.sum(simd);
             for (half, terms_half) in terms.halves.iter().enumerate() {
-                let weight = f64x8::from_slice(simd, &terms.weights[half * LANES / 2..][..LANES / 2]);
+                let weight = terms.losses.weights(simd, half);
                 let [x, y, s, t] = terms_half.pair;
                 forward.add([x, y], &terms_half.forward, [s, t], weight);
                 backward.add([s, t], &terms_half.backward, [x, y], weight);
@@ -135,8 +131,7 @@ impl TransferProblem<'_> {
 /// The terms of a block of pairs. The loss is 1 where a point maps behind the camera.
 struct Terms<S: Simd> {
     halves: [TermsHalf<S>; 2],
-    losses: [f64; LANES],
-    weights: [f64; LANES],
+    losses: BlockLosses,
 }
 
 /// The pairs, `H a` and `H⁻¹ b`.

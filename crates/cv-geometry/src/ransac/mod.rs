@@ -10,7 +10,7 @@ mod scorer;
 
 pub use options::{LocalOptimization, RobustOptions, Sampling, Scoring};
 pub use sampler::{Prosac, Sampler, Uniform};
-pub(crate) use scorer::LeastSquaresLoss;
+pub(crate) use scorer::{BlockLosses, LeastSquaresLoss};
 pub use scorer::{Msac, Scorer, TukeyBiweight};
 
 use crate::EstimateError;

@@ -1,7 +1,7 @@
 //! Loss functions by which models are scored.
 
 use crate::match_blocks::LANES;
-use fearless_simd::{Level, dispatch};
+use fearless_simd::{Level, dispatch, f64x8, prelude::*};
 
 /// A robust loss ρ(u) of `u = (residual / threshold)²`, from 0 at `u = 0` to 1 for outliers (and for NaN).
 pub trait Scorer: std::fmt::Debug + Sync {
@@ -28,6 +28,36 @@ pub trait Scorer: std::fmt::Debug + Sync {
                 weights[i] = if is_below_cutoff { weight } else { 0.0 };
             }
         })
+    }
+}
+
+/// Losses and weights of a block of residuals.
+pub(crate) struct BlockLosses {
+    losses: [f64; LANES],
+    weights: [f64; LANES],
+}
+
+impl BlockLosses {
+    /// Evaluates the loss of a block, whose first `count` lanes hold residuals; the others have a loss of 1.
+    #[inline(always)]
+    pub(crate) fn new(scorer: &dyn Scorer, mut u: [f64; LANES], count: usize) -> Self {
+        u[count..].fill(f64::NAN);
+        let (mut losses, mut weights) = ([0.0; LANES], [0.0; LANES]);
+        scorer.losses_and_weights(&u, &mut losses, &mut weights);
+        Self { losses, weights }
+    }
+
+    /// Returns the weights of a half of the block.
+    #[inline(always)]
+    pub(crate) fn weights<S: Simd>(&self, simd: S, half: usize) -> f64x8<S> {
+        f64x8::from_slice(simd, &self.weights[half * LANES / 2..][..LANES / 2])
+    }
+
+    /// Adds the losses of both halves.
+    #[inline(always)]
+    pub(crate) fn sum<S: Simd>(&self, simd: S) -> f64x8<S> {
+        let (first, second) = self.losses.split_at(LANES / 2);
+        f64x8::from_slice(simd, first) + f64x8::from_slice(simd, second)
     }
 }
 
