@@ -1,6 +1,6 @@
 //! The Sampson error of epipolar geometry, and refinement by minimizing it.
 
-use crate::match_blocks::{Halves, LANES, MatchBlock, PairBlocks, sum_lanes};
+use crate::match_blocks::{Halves, LANES, MatchBlock, PairBlocks, load_half, sum_lanes};
 use crate::ransac::{BlockLosses, Scorer};
 use cv_core::{Correspondence, Matrix3, Vector3};
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
@@ -55,7 +55,7 @@ impl<'a, M: Epipolar<N>, const N: usize> SampsonProblem<'a, M, N> {
             let terms = self.terms(simd, &f, block, count);
             cost += terms.losses.sum(simd);
         }
-        sum_lanes(cost) - self.pairs.padding() as f64
+        self.pairs.cost(cost)
     }
 
     /// Computes the cost and the normal equations.
@@ -89,7 +89,7 @@ impl<'a, M: Epipolar<N>, const N: usize> SampsonProblem<'a, M, N> {
             }
         }
         Sums {
-            cost: sum_lanes(cost) - self.pairs.padding() as f64,
+            cost: self.pairs.cost(cost),
             hessian: std::array::from_fn(|i| std::array::from_fn(|j| sum_lanes(hessian[i][j]))),
             gradient: std::array::from_fn(|i| sum_lanes(gradient[i])),
         }
@@ -115,10 +115,7 @@ struct TermsHalf<S: Simd> {
 impl<S: Simd> TermsHalf<S> {
     #[inline(always)]
     fn new(simd: S, f: &[f64; 9], block: &[Halves; 4], half: usize) -> Self {
-        let x = f64x8::from_slice(simd, &block[0][half]);
-        let y = f64x8::from_slice(simd, &block[1][half]);
-        let s = f64x8::from_slice(simd, &block[2][half]);
-        let t = f64x8::from_slice(simd, &block[3][half]);
+        let [x, y, s, t] = load_half(simd, block, half);
         let l = [x * f[0] + y * f[1] + f[2], x * f[3] + y * f[4] + f[5]];
         let m = [s * f[0] + t * f[3] + f[6], s * f[1] + t * f[4] + f[7]];
         let c = s * l[0] + t * l[1] + (x * f[6] + y * f[7] + f[8]);

@@ -55,7 +55,8 @@ impl Normalizer {
 /// A block of [`LANES`] values in f64, half of them in each array: one AVX-512 register, two of AVX2.
 pub(crate) type Halves = [[f64; LANES / 2]; 2];
 
-/// Correspondences in f64 as blocks of [`LANES`] (structure of arrays): x1, y1, x2, y2. Sums over them in vectors.
+/// Correspondences in f64 as blocks of [`LANES`] (structure of arrays): x1, y1, x2, y2; zero after the last one. Sums over
+/// them in vectors.
 #[derive(Debug, Clone)]
 pub(crate) struct PairBlocks {
     blocks: Vec<[Halves; 4]>,
@@ -79,10 +80,22 @@ impl PairBlocks {
         self.blocks.iter().enumerate().map(|(index, block)| (block, (self.count - index * LANES).min(LANES)))
     }
 
-    /// Returns the number of lanes after the last pair.
-    pub(crate) fn padding(&self) -> usize {
-        self.blocks.len() * LANES - self.count
+    /// Returns the sum of the losses of all pairs, given those of the lanes. Lanes after the last pair have a loss of 1.
+    #[inline(always)]
+    pub(crate) fn cost<S: Simd>(&self, losses: f64x8<S>) -> f64 {
+        sum_lanes(losses) - (self.blocks.len() * LANES - self.count) as f64
     }
+}
+
+/// Loads a half of a block: x1, y1, x2, y2.
+#[inline(always)]
+pub(crate) fn load_half<S: Simd>(simd: S, [x, y, s, t]: &[Halves; 4], half: usize) -> [f64x8<S>; 4] {
+    [
+        f64x8::from_slice(simd, &x[half]),
+        f64x8::from_slice(simd, &y[half]),
+        f64x8::from_slice(simd, &s[half]),
+        f64x8::from_slice(simd, &t[half]),
+    ]
 }
 
 /// Sums the lanes pairwise, in a fixed order.

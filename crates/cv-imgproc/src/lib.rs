@@ -25,6 +25,7 @@
 //! * Empty images give empty results. Unless stated otherwise, a NaN pixel affects only results whose window contains it.
 //! * Rows are processed in parallel; results do not depend on the number of threads or the instruction set.
 
+mod byte_windows;
 mod color;
 mod connected_components;
 mod gaussian;

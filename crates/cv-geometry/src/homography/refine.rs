@@ -1,6 +1,6 @@
 //! Refinement of a homography on the symmetric transfer error.
 
-use crate::match_blocks::{Halves, LANES, PairBlocks, sum_lanes};
+use crate::match_blocks::{Halves, LANES, PairBlocks, load_half, sum_lanes};
 use crate::ransac::{BlockLosses, Scorer};
 use cv_core::Matrix3;
 use cv_numeric::{LeastSquares, LmOptions, NormalEquations, levenberg_marquardt};
@@ -106,7 +106,7 @@ impl TransferProblem<'_> {
         for (block, count) in self.pairs.iter() {
             cost += self.terms(simd, h, g, block, count).losses.sum(simd);
         }
-        sum_lanes(cost) - self.pairs.padding() as f64
+        self.pairs.cost(cost)
     }
 
     /// Computes the cost and the normal equations of both directions.
@@ -124,7 +124,7 @@ impl TransferProblem<'_> {
                 backward.add([s, t], &terms_half.backward, [x, y], weight);
             }
         }
-        (sum_lanes(cost) - self.pairs.padding() as f64, forward.total(), backward.total())
+        (self.pairs.cost(cost), forward.total(), backward.total())
     }
 }
 
@@ -144,10 +144,7 @@ struct TermsHalf<S: Simd> {
 impl<S: Simd> TermsHalf<S> {
     #[inline(always)]
     fn new(simd: S, h: &[f64; 9], g: &[f64; 9], block: &[Halves; 4], half: usize) -> Self {
-        let x = f64x8::from_slice(simd, &block[0][half]);
-        let y = f64x8::from_slice(simd, &block[1][half]);
-        let s = f64x8::from_slice(simd, &block[2][half]);
-        let t = f64x8::from_slice(simd, &block[3][half]);
+        let [x, y, s, t] = load_half(simd, block, half);
         Self { pair: [x, y, s, t], forward: Mapped::new(h, x, y), backward: Mapped::new(g, s, t) }
     }
 
