@@ -126,8 +126,7 @@ pub(crate) struct Args {
     /// Leave unmatched pixels invalid instead of filling them.
     #[arg(long)]
     no_fill: bool,
-    /// Quality mode: local expansion moves over slanted planes. Sharper depth discontinuities and planar surfaces, a third fewer errors, about fifty times the time (2 s for 0.35 Mpx
-    /// on two cores).
+    /// Quality mode: local expansion moves over slanted planes. Sharper depth discontinuities and planar surfaces, a quarter fewer errors, about thirty times the time.
     #[arg(long)]
     quality: bool,
     /// Intensity term added to the census cost, for sharper depth discontinuities.
