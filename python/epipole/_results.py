@@ -94,8 +94,8 @@ class Depth(_Result):
     """With ``cloud=True``: the colored points; with ``rig`` in the frame of its left camera."""
     few_matches: tuple[int, int] | None
     """For a poorly matched pair that was not refused: number of features with a consistent disparity, and number of features; else None."""
-    vertical_offset: tuple[float, float, float] | None
-    """Corrected vertical disparity in px: at the center, and its differences from the left to the right border and from top to bottom; None if none was corrected."""
+    vertical_offset: tuple[float, float, float, float, float, float] | None
+    """Corrected vertical disparity in px, a quadratic function of the position: the coefficients of 1, x, y, x², xy and y², with x and y relative to the center of the right image, in widths and heights; None if none was corrected."""
     disparities: tuple[int, int]
     """Smallest disparity of the search range, and its size."""
     valid_fraction: float

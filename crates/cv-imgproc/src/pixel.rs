@@ -1,5 +1,6 @@
 //! Sample types that can be interpolated.
 
+use crate::remap_vertical::interpolate_rows;
 use cv_core::{ImageView, Sample};
 
 /// A sample type that can be interpolated.
@@ -8,6 +9,9 @@ pub trait Pixel: Sample {
     fn to_f32(self) -> f32;
     /// Converts to the nearest value of this type; integers saturate, and NaN becomes 0.
     fn from_f32(value: f32) -> Self;
+    /// Interpolates by cubic convolution between rows 1 and 2 of four adjacent ones, at the fraction of each sample, 0 to 1. Not generic, so that
+    /// it is compiled with the optimizations of this crate.
+    fn interpolate_rows(rows: [&[Self]; 4], fractions: &[f32], out: &mut [Self]);
     /// Returns the view as 8-bit where that is its type, for integer arithmetic.
     #[inline(always)]
     fn as_bytes<const C: usize>(_: ImageView<'_, Self, C>) -> Option<ImageView<'_, u8, C>> {
@@ -40,6 +44,9 @@ impl Pixel for f32 {
     fn from_f32(value: f32) -> Self {
         value
     }
+    fn interpolate_rows(rows: [&[Self]; 4], fractions: &[f32], out: &mut [Self]) {
+        interpolate_rows(rows, fractions, out);
+    }
 }
 
 impl Pixel for u8 {
@@ -50,6 +57,9 @@ impl Pixel for u8 {
     #[inline(always)]
     fn from_f32(value: f32) -> Self {
         rounded(value, 255.0) as u8
+    }
+    fn interpolate_rows(rows: [&[Self]; 4], fractions: &[f32], out: &mut [Self]) {
+        interpolate_rows(rows, fractions, out);
     }
     #[inline(always)]
     fn as_bytes<const C: usize>(view: ImageView<'_, Self, C>) -> Option<ImageView<'_, u8, C>> {
@@ -69,6 +79,9 @@ impl Pixel for u16 {
     #[inline(always)]
     fn from_f32(value: f32) -> Self {
         rounded(value, 65535.0) as u16
+    }
+    fn interpolate_rows(rows: [&[Self]; 4], fractions: &[f32], out: &mut [Self]) {
+        interpolate_rows(rows, fractions, out);
     }
 }
 

@@ -95,7 +95,7 @@ pub(crate) const KEYS: [[f32; 4]; 4] =
 
 /// Computes the four weights of Keys's kernel for a fraction in 0 to 1.
 #[inline(always)]
-fn keys_weights(t: f32) -> [f32; 4] {
+pub(crate) fn keys_weights(t: f32) -> [f32; 4] {
     let mut weights = KEYS[0];
     for coefficients in &KEYS[1..] {
         for (weight, c) in weights.iter_mut().zip(coefficients) {

@@ -2,13 +2,13 @@
 
 use crate::disparity_range::{is_exchanged, match_pair, range_from_matches};
 use crate::no_pair::{FeatureAgreement, FewMatches, NoPairCause, diagnose};
-use crate::vertical_offset::{Alignment, VerticalOffset};
+use crate::vertical_alignment::Alignment;
 use crate::{Progress, RangeError};
 use cv_core::{Cancelled, GrayF32, Image, ImageView, PointCloud, RgbU8, StageClock};
 use cv_imgproc::Pixel;
 use cv_stereo::{
     DisparityMap, DisparityMatcher, GeometryError, Intensity, RectifyError, StereoError, StereoGeometry, StereoMatcher,
-    StereoOptions,
+    StereoOptions, VerticalOffset,
 };
 
 /// How the range of disparities is chosen.
@@ -42,7 +42,7 @@ pub struct DepthOptions {
     pub range: (f32, f32),
     /// Policy for a pair with few matches. Default [`FewMatches::Check`].
     pub few_matches: FewMatches,
-    /// Whether a vertical disparity of a third of a pixel to 8 px, estimated from the pair's matches or features, is
+    /// Whether a vertical disparity of a tenth of a pixel to 8 px, estimated from coarse matches or from features, is
     /// corrected; for a film it is estimated on the first frame that determines it. Default true.
     pub align: bool,
 }
@@ -91,7 +91,7 @@ pub struct DepthResult {
     pub geometry: Option<StereoGeometry>,
     /// Agreement of feature matches with a map of few matched pixels; `None` where enough are matched.
     pub feature_agreement: Option<FeatureAgreement>,
-    /// The vertical disparity that was corrected; `None` where it was below a third of a pixel, or not estimated.
+    /// The vertical disparity that was corrected; `None` where it was below a tenth of a pixel, or not estimated.
     pub vertical_offset: Option<VerticalOffset>,
     /// Stage names and their seconds. `match` is the matcher from the gray images to checked disparities; `prepare` is
     /// its memory allocation and `free` its deallocation, for which the system takes a tenth of a millisecond per MB.
@@ -246,8 +246,7 @@ pub(crate) fn to_rgb8<T: Intensity, const C: usize>(photo: ImageView<'_, T, C>) 
     rgb
 }
 
-/// Returns the matcher's options, with the range of disparities of feature matches where it is requested. In quality
-/// mode the vertical disparity is estimated here too: a second run would take seconds.
+/// Returns the matcher's options, with the range of disparities of feature matches where it is requested.
 pub(crate) fn matcher_options<T: Intensity + Pixel, const C: usize>(
     left: ImageView<'_, T, C>,
     right: ImageView<'_, T, C>,
@@ -255,18 +254,13 @@ pub(crate) fn matcher_options<T: Intensity + Pixel, const C: usize>(
     alignment: &mut Alignment,
     progress: &dyn Progress,
 ) -> Result<StereoOptions, DepthError> {
-    let stereo = match options.disparities {
+    Ok(match options.disparities {
         DisparityRange::Given => options.stereo.clone(),
         DisparityRange::FromMatches { min } => {
             let (min_disparity, disparities) = feature_range([left, right], min, alignment, progress)?;
             StereoOptions { min_disparity, disparities, ..options.stereo.clone() }
         }
-    };
-    if stereo.quality {
-        let mut plain = StereoMatcher::new(StereoOptions { quality: false, ..stereo.clone() })?;
-        alignment.compute(&mut plain, [left, right], &mut DisparityMap::empty(), progress)?;
-    }
-    Ok(stereo)
+    })
 }
 
 /// Returns the smallest disparity (`min` where given) and the number of disparities of a pair's feature matches.
@@ -278,10 +272,10 @@ fn feature_range<T: Intensity, const C: usize>(
 ) -> Result<(i32, usize), DepthError> {
     let mut matches = match_pair(to_rgb8(left).view(), to_rgb8(right).view(), progress)?;
     if left.size() == right.size() {
-        alignment.update_from_features(&matches, left.size())?;
+        alignment.update_from_features(&matches, left.size());
     }
     if let Some(offset) = alignment.offset {
-        offset.correct(&mut matches);
+        offset.correct_matches(&mut matches);
     }
     let (first, count) = range_from_matches(&matches)?;
     let range = (first, first + count as i32 - 1);
@@ -312,12 +306,14 @@ pub fn depth<T: Intensity + Pixel, const C: usize>(
         clock.lap("range");
     }
     let mut matcher = StereoMatcher::new(stereo)?;
+    alignment.estimate([left, right], matcher.options(), progress)?;
+    clock.lap("align");
     let limits = (options.range, options.few_matches);
     let mut run = || {
         let mut map = DisparityMap::empty();
         matcher.prepare(left.width(), left.height(), &mut map, progress)?;
         clock.lap("prepare");
-        let found = compute_depth(&mut matcher, [left, right], map, geometry, limits, &mut alignment, progress)?;
+        let found = compute_depth(&mut matcher, [left, right], map, geometry, limits, &alignment, progress)?;
         Ok(found.0)
     };
     let mut result = match run() {
@@ -355,7 +351,7 @@ pub fn depth_with<T: Intensity + Pixel, const C: usize>(
     progress: &dyn Progress,
 ) -> Result<DepthResult, DepthError> {
     let limits = (range, FewMatches::default());
-    compute_depth(matcher, [left, right], DisparityMap::empty(), geometry, limits, &mut Alignment::off(), progress)
+    compute_depth(matcher, [left, right], DisparityMap::empty(), geometry, limits, &Alignment::off(), progress)
         .map(|(result, _)| result)
 }
 
@@ -372,13 +368,14 @@ pub(crate) fn compute_depth<T: Intensity + Pixel, const C: usize>(
     mut map: DisparityMap,
     geometry: Option<&StereoGeometry>,
     (range, policy): ((f32, f32), FewMatches),
-    alignment: &mut Alignment,
+    alignment: &Alignment,
     progress: &dyn Progress,
 ) -> Result<(DepthResult, Option<Image<T, C>>), DepthError> {
     check_range(range, geometry)?;
     let mut clock = StageClock::new();
-    let corrected = alignment.compute(matcher, [left, right], &mut map, progress)?;
+    let corrected = alignment.correct(right)?;
     let right = corrected.as_ref().map_or(right, Image::view);
+    matcher.compute_into(left, right, &mut map, progress)?;
     clock.lap("match");
     let disparities = matcher.disparities();
     let feature_agreement = check_matched_fraction(&map, left, right, disparities, policy, progress)?;

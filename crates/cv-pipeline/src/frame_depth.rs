@@ -1,11 +1,13 @@
 //! Disparity and depth of the frames of a stereo film.
 
 use crate::depth::{check_matched_fraction, check_range, compute_depth, initial_alignment, matcher_options, to_rgb8};
-use crate::vertical_offset::{Alignment, VerticalOffset};
+use crate::vertical_alignment::Alignment;
 use crate::{DepthError, DepthOptions, DisparityRange, Progress, RigDepthResult};
 use cv_core::{Image, ImageView, PointCloud, Pose, StageClock, Vector3};
 use cv_imgproc::{Pixel, WarpMap};
-use cv_stereo::{DisparityMap, Intensity, Rectification, RectifyError, StereoGeometry, StereoMatcher, StereoOptions};
+use cv_stereo::{
+    DisparityMap, Intensity, Rectification, RectifyError, StereoGeometry, StereoMatcher, StereoOptions, VerticalOffset,
+};
 use std::any::Any;
 
 /// Matches the frames of a film with one allocation and one range of disparities. With [`DisparityRange::FromMatches`],
@@ -95,8 +97,10 @@ impl FrameDepth {
             [left, right],
             progress,
         )?;
-        let corrected = self.alignment.compute(matcher, [left, right], &mut self.map, progress)?;
+        self.alignment.estimate([left, right], matcher.options(), progress)?;
+        let corrected = self.alignment.correct(right)?;
         let right = corrected.as_ref().map_or(right, Image::view);
+        matcher.compute_into(left, right, &mut self.map, progress)?;
         let StereoOptions { min_disparity, disparities, .. } = *matcher.options();
         check_matched_fraction(
             &self.map,
@@ -140,13 +144,15 @@ impl FrameDepth {
         if is_first {
             clock.lap("range");
         }
+        self.alignment.estimate([left, right], matcher.options(), progress)?;
+        clock.lap("align");
         let mut map = DisparityMap::empty();
         matcher.prepare(left.width(), left.height(), &mut map, progress)?;
         clock.lap("prepare");
         let limits = (self.options.range, self.options.few_matches);
         let geometry = self.geometry.as_ref();
         let (mut maps, corrected) =
-            compute_depth(matcher, [left, right], map, geometry, limits, &mut self.alignment, progress)?;
+            compute_depth(matcher, [left, right], map, geometry, limits, &self.alignment, progress)?;
         maps.stages.iter().for_each(|(stage, seconds)| clock.add(stage, *seconds));
         maps.stages = clock.into_stages();
         let images = [to_rgb8(left), to_rgb8(corrected.as_ref().map_or(right, Image::view))];
@@ -201,9 +207,9 @@ impl FrameDepth {
     }
 }
 
-/// Whether one matcher serves any pair: its range is given, and it needs no plain matcher for the vertical disparity.
+/// Whether one matcher serves any pair: its range is given.
 fn fits_all_pairs(options: &DepthOptions) -> bool {
-    options.disparities == DisparityRange::Given && !options.stereo.quality
+    options.disparities == DisparityRange::Given
 }
 
 /// Tells a matcher which pixels of the rectified images have data.

@@ -48,8 +48,7 @@ mod rig_depth;
 mod segment;
 mod sfm;
 mod similar;
-mod vertical_matches;
-mod vertical_offset;
+mod vertical_alignment;
 
 pub use advice::Advice;
 pub use axes::Axes;
@@ -101,7 +100,6 @@ pub use sfm::{
     SfmDenseError, SfmDenseOptions, SfmJobError, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, gps_centers,
     place_model, sfm, sfm_covariance, sfm_dense, sfm_pairs, sfm_photo, sfm_solve,
 };
-pub use vertical_offset::VerticalOffset;
 
 /// Types of the stereo stage: options and results, rectification, geometry and scores.
 pub mod stereo {
@@ -109,8 +107,8 @@ pub mod stereo {
     pub use cv_stereo::{
         BAD_THRESHOLDS, Census, DisparityMap, DisparityMatcher, DisparityScores, EvaluateError, GeometryError,
         Intensity, IntensityCost, Paths, PixelState, Rectification, RectifiedView, RectifyError, RectifyOptions,
-        Search, Smoothing, StereoError, StereoGeometry, StereoMatcher, StereoOptions, Subpixel, evaluate_disparity,
-        non_occluded,
+        Search, Smoothing, StereoError, StereoGeometry, StereoMatcher, StereoOptions, Subpixel, VerticalOffset,
+        evaluate_disparity, non_occluded,
     };
 }
 

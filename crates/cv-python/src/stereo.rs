@@ -229,6 +229,9 @@ impl PyPairDepth {
     }
 }
 
+/// A tuple in Python, where an array would be a list.
+type Coefficients = (f64, f64, f64, f64, f64, f64);
+
 /// Makes the Python result.
 fn made<'py>(
     py: Python<'py>,
@@ -257,7 +260,10 @@ fn made<'py>(
             ),
             ("cloud", cloud.map_or_else(none, |cloud| cloud::made(py, cloud))?),
             ("few_matches", object(py, found.feature_agreement.map(|few| (few.agree, few.seen)))?),
-            ("vertical_offset", object(py, found.vertical_offset.map(|o| (o.at_center, o.across, o.down)))?),
+            (
+                "vertical_offset",
+                object(py, found.vertical_offset.map(|offset| Coefficients::from(offset.coefficients())))?,
+            ),
             ("disparities", object(py, found.disparities)?),
             ("valid_fraction", object(py, valid)?),
             ("matched_fraction", object(py, matched)?),

@@ -58,6 +58,8 @@ mod sgm;
 mod speckle;
 mod surface_filling;
 mod surfaces;
+mod vertical_matches;
+mod vertical_offset;
 mod window_sweep;
 mod winner;
 mod winner_checks;
@@ -74,3 +76,4 @@ pub use options::{Census, IntensityCost, Paths, Search, Smoothing, StereoOptions
 pub use path_sums::PathSums;
 pub use rectify::{Rectification, RectifiedView, RectifyError, RectifyOptions};
 pub use rectify_scene::SceneRectification;
+pub use vertical_offset::VerticalOffset;

@@ -69,7 +69,7 @@ impl Args {
                 self.report_range(sequence, context);
             }
             if !aligned && let Some(offset) = sequence.frames.vertical_offset() {
-                super::warn_of_alignment(&offset, context);
+                super::report_alignment(&offset, context);
                 aligned = true;
             }
             frames.push((left.clone(), matched, valid));

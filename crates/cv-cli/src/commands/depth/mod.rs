@@ -16,9 +16,9 @@ use cv_core::ImageView;
 use cv_io::ply::PlyEncoding;
 use cv_pipeline::stereo::{
     Census, DisparityMap, IntensityCost, Paths, PixelState, Rectification, RectifyOptions, Search, Smoothing,
-    StereoGeometry, StereoMatcher, StereoOptions,
+    StereoGeometry, StereoMatcher, StereoOptions, VerticalOffset,
 };
-use cv_pipeline::{DepthError, DepthOptions, DepthResult, FrameDepth, RigDepthResult, VerticalOffset};
+use cv_pipeline::{DepthError, DepthOptions, DepthResult, FrameDepth, RigDepthResult};
 use maps::write_map;
 use options::{Range, parse_range};
 use pairing::PairBy;
@@ -141,8 +141,8 @@ pub(crate) struct Args {
     /// Intensity difference, in gray levels of 255, above which --smoothing preserves edges [default: 24; 1.5 for wls].
     #[arg(long, value_name = "LEVELS")]
     sigma: Option<f32>,
-    /// Do not correct vertical disparity. By default, a vertical disparity of up to 8 px (epipolar misalignment) is estimated and the right image warped; for frames,
-    /// the correction of the first misaligned pair is used for all.
+    /// Do not correct vertical disparity. By default, a vertical disparity of a tenth of a pixel to 8 px (epipolar misalignment) is estimated and the right image warped;
+    /// for frames, the correction of the first pair that determines it is used for all.
     #[arg(long)]
     no_align: bool,
     /// Keep the result of a poorly matched pair. By default, a pair of which less than a fifth of the pixels is matched is refused if feature matches show what is wrong
@@ -219,7 +219,7 @@ impl Run for Args {
         let DepthResult { map, disparities, .. } = &job.maps;
         let (valid, matched) = (map.valid_fraction(), map.matched_fraction());
         if let Some(offset) = &job.maps.vertical_offset {
-            warn_of_alignment(offset, context);
+            report_alignment(offset, context);
         }
         warn_of_filling(&job.maps, context);
         report_border(map.no_data_fraction(), context);
@@ -233,10 +233,7 @@ impl Run for Args {
             .with("no_data_fraction", map.no_data_fraction())
             .with("disparities", disparities.1)
             .with("min_disparity", disparities.0)
-            .with(
-                "vertical_offset",
-                job.maps.vertical_offset.map(|offset| [offset.at_center, offset.across, offset.down]),
-            )
+            .with("vertical_offset", job.maps.vertical_offset.map(|offset| offset.coefficients()))
             .summary(format!(
                 "{width}×{height} px, {:.1} % matched and confirmed, {:.1} % with a disparity",
                 100.0 * matched,
@@ -245,15 +242,17 @@ impl Run for Args {
     }
 }
 
-/// Warns that the vertical disparity of the pair was corrected.
-fn warn_of_alignment(offset: &VerticalOffset, context: &Context) {
-    context.warn(format!(
-        "the pair had a vertical disparity of up to {:.1} px ({:+.1} at the center, {:+.1} from left to right, {:+.1} from top to bottom); the rows have been aligned: recalibrate the cameras, or see --no-align",
-        offset.largest(),
-        offset.at_center,
-        offset.across,
-        offset.down
-    ));
+/// Reports that the vertical disparity of the pair was corrected; warns if the cameras should be calibrated again.
+fn report_alignment(offset: &VerticalOffset, context: &Context) {
+    let size = format!("vertical disparity of up to {:.2} px", offset.largest());
+    if offset.is_notable() {
+        context.warn(format!(
+            "the pair had a {size} ({:+.2} at the center, {:+.2} from left to right, {:+.2} from top to bottom); the rows have been aligned: recalibrate the cameras, or see --no-align",
+            offset.at_center, offset.across, offset.down
+        ));
+    } else {
+        context.note(format!("a {size} has been corrected; --no-align disables this"));
+    }
 }
 
 /// Reports the fraction of the left image that is a black border.
