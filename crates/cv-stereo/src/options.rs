@@ -208,7 +208,7 @@ pub struct StereoOptions {
     /// (0.5 % of it or more) or along 0.4 of a side (0.1 % or more), with a smooth outline. Their pixels are [`crate::PixelState::NoData`]. Default true. Masks
     /// ([`crate::StereoMatcher::set_masks`]) take precedence.
     pub ignore_black_borders: bool,
-    /// Quality mode: local expansion moves over slanted planes (Taniai et al., PAMI 2018) after semi-global matching. Takes about fifty times
+    /// Quality mode: local expansion moves over slanted planes (Taniai et al., PAMI 2018) after semi-global matching. Takes about forty-five times
     /// as long and leaves four fifths of the errors above 2 px (Middlebury 2014, quarter size), on roads half. Default
     /// false.
     pub quality: bool,

@@ -19,8 +19,18 @@ const OUTLIER_OFFSET: f64 = 12.0;
 const MIN_BLOCK_INLIER_RATIO: f64 = 0.75;
 /// Minimum number of inliers within a pixel.
 const MIN_INLIERS: usize = 32;
-/// Thresholds in px of the fits, each relative to the previous one, and whether the fit is quadratic.
-const FITS: [(f64, bool); 6] = [(4.0, false), (2.0, false), (1.0, false), (1.0, true), (0.7, true), (0.5, true)];
+/// Thresholds in px of the fits, each relative to the previous one; from which of them on squares and products are fitted.
+const THRESHOLDS: [f64; 6] = [4.0, 2.0, 1.0, 1.0, 0.7, 0.5];
+const FIRST_QUADRATIC: usize = 3;
+/// Numbers of coefficients of the models: none, a constant, an affine and a quadratic function.
+const MODELS: [usize; 4] = [0, 1, 3, 6];
+/// Largest cost of a model in cross-validation, as a ratio of that without offset. Public pairs with an offset have 0.86 or less, those without one, and
+/// pairs of a calibrated rig, mostly 0.93 or more.
+const MAX_COST: f64 = 0.9;
+/// Of the models with up to this ratio of the smallest cost, the simplest is taken.
+const MAX_EXCESS: f64 = 1.02;
+/// Fields of the image across and down, of which every other one is left out in cross-validation.
+const FIELDS: f64 = 8.0;
 /// Weight of the squared coefficients other than the constant, in matches of average weight: what the matches do not determine becomes zero.
 const REGULARIZATION: f64 = 0.1;
 
@@ -105,31 +115,30 @@ impl VerticalOffset {
         Self::from_matches(&matches.iter().map(vertical).collect::<Vec<_>>(), min_inlier_ratio, size)
     }
 
-    /// As [`VerticalOffset::from_correspondences`]. Least squares on the matches near the previous estimate, starting at the mode.
+    /// As [`VerticalOffset::from_correspondences`]. The model is selected by cross-validation, so that few or
+    /// erroneous matches give no offset.
     fn from_matches(matches: &[VerticalMatch], min_inlier_ratio: f64, size: (usize, usize)) -> Option<Self> {
-        let candidates: Vec<&VerticalMatch> = matches.iter().filter(|m| m.offset.abs() <= OUTLIER_OFFSET).collect();
-        let mut sorted: Vec<f64> = candidates.iter().map(|m| m.offset).collect();
-        sorted.sort_unstable_by(f64::total_cmp);
-        // The window of two pixels with most matches.
-        let count_within = |i: &usize| sorted.partition_point(|d| *d <= sorted[*i] + 2.0) - i;
-        let mode = (0..sorted.len()).max_by_key(|i| (count_within(i), std::cmp::Reverse(*i)))?;
-        let mut model = Vector6::zeros();
-        model[0] = sorted[mode + count_within(&mode) / 2];
-        let residual = |model: &Vector6<f64>, m: &VerticalMatch| (model.dot(&terms(m.position, size)) - m.offset).abs();
-        let mean_weight = candidates.iter().map(|m| m.weight).sum::<f64>() / candidates.len() as f64;
-        for (threshold, is_quadratic) in FITS {
-            let (linear, square) = (REGULARIZATION, if is_quadratic { REGULARIZATION } else { f64::MAX.sqrt() });
-            let diagonal = Vector6::new(1e-9, linear, linear, square, square, square) * mean_weight;
-            let mut normal = Matrix6::from_diagonal(&diagonal);
-            let mut right_side = Vector6::zeros();
-            for m in candidates.iter().filter(|m| residual(&model, m) <= threshold) {
-                let terms = terms(m.position, size);
-                normal += terms * terms.transpose() * m.weight;
-                right_side += terms * (m.weight * m.offset);
-            }
-            model = normal.cholesky()?.solve(&right_side);
-        }
-        let inliers = candidates.iter().filter(|m| residual(&model, m) <= 1.0).count();
+        let candidates: Vec<VerticalMatch> =
+            matches.iter().copied().filter(|m| m.offset.abs() <= OUTLIER_OFFSET).collect();
+        // Cross-validation: errors of neighboring matches are alike, so that fields are left out, not matches.
+        let field = |m: &VerticalMatch| {
+            let terms = terms(m.position, size);
+            ((FIELDS * (terms[1] + 0.5)).floor() + (FIELDS * (terms[2] + 0.5)).floor()) as i64 & 1
+        };
+        let folds = [0, 1].map(|fold| candidates.iter().copied().filter(|m| field(m) == fold).collect::<Vec<_>>());
+        let held_out_cost = |coefficients: usize| -> f64 {
+            let cost = |(fitted, held_out): (&[VerticalMatch], &[VerticalMatch])| {
+                let model = fit(fitted, coefficients, size).unwrap_or_default();
+                held_out.iter().map(|m| m.weight.sqrt() * residual(&model, m, size).min(1.0)).sum::<f64>()
+            };
+            cost((&folds[0], &folds[1])) + cost((&folds[1], &folds[0]))
+        };
+        let costs = MODELS.map(held_out_cost);
+        let smallest = costs.into_iter().fold(f64::INFINITY, f64::min);
+        let simplest = costs.iter().position(|cost| *cost <= MAX_EXCESS * smallest)?;
+        let model = if costs[simplest] <= MAX_COST * costs[0] { simplest } else { 0 };
+        let model = fit(&candidates, MODELS[model], size)?;
+        let inliers = candidates.iter().filter(|m| residual(&model, m, size) <= 1.0).count();
         let [at_center, across, down, xx, xy, yy] = model.into();
         let estimate = Self { at_center, across, down, curvature: [xx, xy, yy], size };
         (inliers >= MIN_INLIERS && inliers as f64 >= min_inlier_ratio * candidates.len() as f64).then_some(estimate)
@@ -149,6 +158,40 @@ impl VerticalOffset {
             m.b.y -= self.at(m.b.x, m.b.y);
         }
     }
+}
+
+/// Returns the distance of a match from a model in px.
+fn residual(model: &Vector6<f64>, m: &VerticalMatch, size: (usize, usize)) -> f64 {
+    (model.dot(&terms(m.position, size)) - m.offset).abs()
+}
+
+/// Fits the first coefficients: least squares on the matches near the previous estimate, starting at the mode; `None` without matches.
+fn fit(matches: &[VerticalMatch], coefficients: usize, size: (usize, usize)) -> Option<Vector6<f64>> {
+    if coefficients == 0 {
+        return Some(Vector6::zeros());
+    }
+    let mut sorted: Vec<f64> = matches.iter().map(|m| m.offset).collect();
+    sorted.sort_unstable_by(f64::total_cmp);
+    // The window of two pixels with most matches.
+    let count_within = |i: &usize| sorted.partition_point(|d| *d <= sorted[*i] + 2.0) - i;
+    let mode = (0..sorted.len()).max_by_key(|i| (count_within(i), std::cmp::Reverse(*i)))?;
+    let mut model = Vector6::zeros();
+    model[0] = sorted[mode + count_within(&mode) / 2];
+    let mean_weight = matches.iter().map(|m| m.weight).sum::<f64>() / matches.len() as f64;
+    for (round, threshold) in THRESHOLDS.into_iter().enumerate() {
+        let count = if round < FIRST_QUADRATIC { coefficients.min(3) } else { coefficients };
+        let regularization = |i: usize| if i == 0 { 1e-9 } else { REGULARIZATION };
+        let mut normal = Matrix6::from_diagonal(&Vector6::from_fn(|i, _| mean_weight * regularization(i)));
+        let mut right_side = Vector6::zeros();
+        for m in matches.iter().filter(|m| residual(&model, m, size) <= threshold) {
+            let mut terms = terms(m.position, size);
+            terms.rows_mut(count, 6 - count).fill(0.0);
+            normal += terms * terms.transpose() * m.weight;
+            right_side += terms * (m.weight * m.offset);
+        }
+        model = normal.cholesky()?.solve(&right_side);
+    }
+    Some(model)
 }
 
 /// Returns the terms of the quadratic function of the position relative to the center, in widths and heights.
@@ -217,14 +260,29 @@ mod tests {
     }
 
     #[test]
+    fn offsets_of_chance_are_none_and_models_are_simple() {
+        // Errors of up to two tenths of a pixel, alike in fields of 100 px.
+        let alike = |x: f64, y: f64| 0.2 * (17.3 * (x / 100.0).floor() + 5.1 * (y / 100.0).floor()).sin();
+        assert_eq!(estimate(&matches(alike)).unwrap().coefficients(), [0.0; 6]);
+        // Independent ones, and a constant offset.
+        let independent = |x: f64, y: f64| 0.2 * (12.9 * x + 78.2 * y).sin();
+        let found = estimate(&matches(|x, y| 1.0 + independent(x, y))).unwrap();
+        assert!(found.coefficients()[1..] == [0.0; 5] && (found.at_center - 1.0).abs() < 0.1, "{found:?}");
+    }
+
+    #[test]
     fn weighted_matches_decide() {
         // Two offsets within the thresholds of the fits: that with the weight.
         let matches = |weights: [f64; 2]| -> Vec<VerticalMatch> {
             let all = matches(|_, _| 0.0).into_iter().enumerate();
-            all.map(|(i, m)| VerticalMatch { position: m.b, offset: 0.4 * (i % 2) as f64, weight: weights[i % 2] })
-                .collect()
+            all.map(|(i, m)| VerticalMatch {
+                position: m.b,
+                offset: 1.0 + 0.4 * (i % 2) as f64,
+                weight: weights[i % 2],
+            })
+            .collect()
         };
-        for (weights, expected) in [([1.0, 1.0], 0.2), ([1.0, 99.0], 0.4), ([99.0, 1.0], 0.0)] {
+        for (weights, expected) in [([1.0, 1.0], 1.2), ([1.0, 99.0], 1.4), ([99.0, 1.0], 1.0)] {
             let found = VerticalOffset::from_matches(&matches(weights), 0.5, SIZE).unwrap();
             assert!((found.at(299.5, 199.5) - expected).abs() < 0.02, "{weights:?}: {found:?}");
         }

@@ -126,7 +126,7 @@ pub(crate) struct Args {
     /// Leave unmatched pixels invalid instead of filling them.
     #[arg(long)]
     no_fill: bool,
-    /// Quality mode: local expansion moves over slanted planes. Sharper depth discontinuities and planar surfaces, a fifth fewer errors, half as many on roads, about fifty times the time.
+    /// Quality mode: local expansion moves over slanted planes. Sharper depth discontinuities and planar surfaces, a fifth fewer errors, half as many on roads, about forty-five times the time.
     #[arg(long)]
     quality: bool,
     /// Intensity term added to the census cost, for sharper depth discontinuities.
