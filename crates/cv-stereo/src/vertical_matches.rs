@@ -5,8 +5,8 @@ use cv_core::{GrayF32, ImageView, Point2, Progress};
 use cv_imgproc::gaussian_blur;
 use cv_parallel::prelude::*;
 
-/// Maximum number of costs (pixels times disparities) of the coarse images, which are half the size or smaller. With 10⁶ to 2·10⁸ the offsets of public pairs
-/// differ by hundredths of a pixel.
+/// Maximum number of costs (pixels times disparities) of the coarse images, which are half the size or smaller. With 10⁶ to 2·10⁸ the offsets of
+/// public pairs differ by hundredths of a pixel.
 const MAX_COARSE_COSTS: usize = 2_000_000;
 /// Number of cells across and down; one pixel is sampled in each.
 const CELLS: (usize, usize) = (48, 32);
@@ -63,7 +63,7 @@ impl CoarseDisparity {
     }
 }
 
-/// Matches a pair at half its size, or smaller if it is large.
+/// Matches a pair at half its size, or smaller if it is large. The options are valid.
 pub(crate) fn match_coarsely(
     gray: [&GrayF32; 2],
     options: &StereoOptions,
@@ -75,11 +75,12 @@ pub(crate) fn match_coarsely(
         scale *= 2;
     }
     let [left, right] = gray.map(|gray| mean_blocks(gray, scale));
-    let first = options.min_disparity.div_euclid(scale as i32);
-    let last = (options.min_disparity + options.disparities as i32 - 1).div_euclid(scale as i32) + 1;
+    // Halves of 32-bit integers: they fit.
+    let first = i64::from(options.min_disparity);
+    let [first, last] = [first, first + options.disparities as i64 - 1].map(|d| d.div_euclid(scale as i64));
     let options = StereoOptions {
-        min_disparity: first,
-        disparities: (last - first + 1) as usize,
+        min_disparity: first as i32,
+        disparities: (last - first) as usize + 2,
         pyramid_levels: 0,
         paths: Paths::Four,
         smoothing: Smoothing::None,
