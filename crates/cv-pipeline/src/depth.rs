@@ -43,7 +43,7 @@ pub struct DepthOptions {
     /// Policy for a pair with few matches. Default [`FewMatches::Check`].
     pub few_matches: FewMatches,
     /// Whether a vertical disparity of a tenth of a pixel to 8 px, estimated from coarse matches or from features, is
-    /// corrected; for a film it is estimated on the first frame that determines it. Default true.
+    /// corrected; for a film it is estimated on the first of eight frames that determines it. Default true.
     pub align: bool,
 }
 
@@ -93,8 +93,8 @@ pub struct DepthResult {
     pub feature_agreement: Option<FeatureAgreement>,
     /// The vertical disparity that was corrected; `None` where it was below a tenth of a pixel, or not estimated.
     pub vertical_offset: Option<VerticalOffset>,
-    /// Stage names and their seconds. `match` is the matcher from the gray images to checked disparities; `prepare` is
-    /// its memory allocation and `free` its deallocation, for which the system takes a tenth of a millisecond per MB.
+    /// Stage names and their seconds. `align` is the estimate of the vertical disparity, and `match` the matcher from the
+    /// gray images (with the correction of the right one) to checked disparities; `prepare` is its memory allocation and `free` its deallocation, for which the system takes a tenth of a millisecond per MB.
     pub stages: Vec<(&'static str, f64)>,
 }
 

@@ -97,7 +97,9 @@ impl FrameDepth {
             [left, right],
             progress,
         )?;
-        self.alignment.estimate([left, right], matcher.options(), progress)?;
+        if self.alignment.estimate([left, right], matcher.options(), progress)? {
+            matcher.forget_frame();
+        }
         let corrected = self.alignment.correct(right)?;
         let right = corrected.as_ref().map_or(right, Image::view);
         matcher.compute_into(left, right, &mut self.map, progress)?;
@@ -144,7 +146,9 @@ impl FrameDepth {
         if is_first {
             clock.lap("range");
         }
-        self.alignment.estimate([left, right], matcher.options(), progress)?;
+        if self.alignment.estimate([left, right], matcher.options(), progress)? {
+            matcher.forget_frame();
+        }
         clock.lap("align");
         let mut map = DisparityMap::empty();
         matcher.prepare(left.width(), left.height(), &mut map, progress)?;

@@ -47,17 +47,17 @@ impl Alignment {
         self.offset = offset.filter(VerticalOffset::is_to_correct);
     }
 
-    /// Estimates the vertical disparity of a pair if it is not known, from blocks near the disparities of a coarse match with these options; from features
-    /// if blocks are not enough.
+    /// Estimates the vertical disparity of a pair if it is not known, from blocks near the disparities of a coarse match with these options; from
+    /// features if blocks are not enough. Returns whether a correction begins with this pair: previous ones of a film were not corrected.
     pub(crate) fn estimate<T: Intensity + Pixel, const C: usize>(
         &mut self,
         [left, right]: [ImageView<'_, T, C>; 2],
         options: &StereoOptions,
         progress: &dyn Progress,
-    ) -> Result<(), DepthError> {
+    ) -> Result<bool, DepthError> {
         // The matcher reports images of different sizes.
         if self.is_closed || left.size() != right.size() {
-            return Ok(());
+            return Ok(false);
         }
         self.attempts += 1;
         let (estimate, matched_fraction) = match VerticalOffset::estimate([left, right], options, progress) {
@@ -66,7 +66,7 @@ impl Alignment {
             // The matcher of the whole pair reports what is wrong with it.
             Err(_) => {
                 self.close(None);
-                return Ok(());
+                return Ok(false);
             }
         };
         if let Some(offset) = estimate.filter(|offset| offset.largest() <= MAX_BLOCK_OFFSET) {
@@ -82,7 +82,7 @@ impl Alignment {
         } else if self.attempts == MAX_ATTEMPTS {
             self.close(None);
         }
-        Ok(())
+        Ok(self.offset.is_some())
     }
 
     /// Returns the corrected right image; `None` without a correction for this size.

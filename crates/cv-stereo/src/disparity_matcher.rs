@@ -20,9 +20,6 @@ pub trait DisparityMatcher<T: Intensity, const C: usize> {
         progress: &dyn Progress,
     ) -> Result<(), StereoError>;
 
-    /// Forgets previous pairs, if they affect the next one ([`crate::StereoOptions::sequence`]). Does nothing by default.
-    fn forget_frame(&mut self) {}
-
     /// Returns the smallest disparity of the search range, in px, and the number of disparities.
     fn disparities(&self) -> (i32, usize);
 
@@ -48,10 +45,6 @@ impl<T: Intensity, const C: usize> DisparityMatcher<T, C> for StereoMatcher {
         progress: &dyn Progress,
     ) -> Result<(), StereoError> {
         Self::compute_into(self, left, right, map, progress)
-    }
-
-    fn forget_frame(&mut self) {
-        Self::forget_frame(self);
     }
 
     fn disparities(&self) -> (i32, usize) {

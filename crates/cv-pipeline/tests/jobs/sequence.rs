@@ -131,7 +131,7 @@ fn a_cut_starts_anew_with_the_same_bytes_on_any_number_of_threads() {
     assert!(expected[2] == alone[2] && expected[3] != alone[3] && expected[1] != alone[1]);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     assert!(pool.install(|| maps(&frames, true)) == expected);
-    // The job forgets a frame that it matches twice, for the vertical alignment.
+    // The first frame is as alone with a correction of its vertical disparity, too.
     let stereo = StereoOptions { disparities: 48, sequence: true, ..Default::default() };
     let mut job = FrameDepth::new(DepthOptions { stereo, ..Default::default() }, None).unwrap();
     let down = |image: &RgbU8| RgbU8::from_fn(SIZE.0, SIZE.1, |x, y| image.at(x, y.saturating_sub(1)));

@@ -142,7 +142,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "LEVELS")]
     sigma: Option<f32>,
     /// Do not correct vertical disparity. By default, a vertical disparity of a tenth of a pixel to 8 px (epipolar misalignment) is estimated and the right image warped;
-    /// for frames, the correction of the first pair that determines it is used for all.
+    /// for frames, the correction of the first pair that determines it, of eight, is used for all.
     #[arg(long)]
     no_align: bool,
     /// Keep the result of a poorly matched pair. By default, a pair of which less than a fifth of the pixels is matched is refused if feature matches show what is wrong
