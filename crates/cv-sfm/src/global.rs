@@ -84,7 +84,8 @@ pub(crate) fn estimate_poses(
     update_tracks(scene, limits(0.0), &all);
     // So are components in an inconsistent position or scale: on a rendered street of 50 views, three components
     // overlapped in scales of 0.7 to 1.
-    if keep_largest_consistent_component(scene, &graph, options.min_pose_inliers) {
+    let pairs: Vec<(usize, usize)> = graph.links.iter().map(|l| (l.a, l.b)).collect();
+    if keep_largest_consistent_component(scene, &pairs, options.min_pose_inliers, 1) {
         update_tracks(scene, limits(0.0), &all);
     }
     Ok(scene.registered().len() > 1)

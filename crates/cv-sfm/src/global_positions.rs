@@ -2,6 +2,7 @@
 //! rays (global positioning).
 
 use crate::scene::Scene;
+use crate::tree_paths::TreePaths;
 use crate::view_graph::ViewGraph;
 use cv_core::{Cancelled, Point3, Pose, Rotation3, Stage, Vector3};
 use cv_geometry::{PairEdge, PairGraph};
@@ -14,6 +15,13 @@ use std::ops::ControlFlow;
 const BASELINE_LOSS_SCALE: f64 = 0.1;
 /// Scale of the Cauchy loss of a ray, in radians: a fifth of a degree.
 const RAY_LOSS_SCALE: f64 = 0.0035;
+
+/// A link is left out if the path between its views through links with at least this many times its matches contradicts
+/// it: accidental matches on repeated texture, some tens between views far apart, pull whole parts of a street to the
+/// wrong place.
+const MIN_PATH_STRENGTH: f64 = 4.0;
+/// Largest difference of a link's baseline from that of the path, in lengths of the path: more than such paths drift.
+const MAX_PATH_ERROR: f64 = 0.2;
 
 /// Residuals of relative centers: the baseline from one center to the other in the world frame, and its inverse length
 /// as weight.
@@ -98,15 +106,29 @@ pub(crate) fn centers_from_baselines(
     let tree = edges.maximum_spanning_forest();
     let Some(root) = edges.center(&tree) else { return Ok(centers) };
     centers[root] = Some(Point3::origin());
+    // By view: length and strength of the edge to its parent.
+    let mut to_parent = vec![(0.0, f64::INFINITY); graph.views];
+    let mut paths = TreePaths::new(graph.views);
     for step in edges.breadth_first(&tree, root) {
-        let baseline = baselines[step.edge].0;
-        let forward = if edges.edges()[step.edge].a == step.parent { baseline } else { -baseline };
+        let (edge, baseline) = (&edges.edges()[step.edge], baselines[step.edge].0);
+        let forward = if edge.a == step.parent { baseline } else { -baseline };
         centers[step.node] = centers[step.parent].map(|parent| parent + forward);
+        to_parent[step.node] = (baseline.norm(), edge.weight);
+        paths.add(&step);
     }
+    let is_plausible = |e: &PairEdge, baseline: &Vector3<f64>| {
+        let (Some(a), Some(b), Some(path)) = (centers[e.a], centers[e.b], paths.between(e.a, e.b)) else {
+            return false;
+        };
+        let (length, weakest) = path.fold((0.0, f64::INFINITY), |(length, weakest): (f64, f64), node| {
+            (length + to_parent[node].0, weakest.min(to_parent[node].1))
+        });
+        MIN_PATH_STRENGTH * e.weight > weakest || (b - a - baseline).norm() <= MAX_PATH_ERROR * length
+    };
     let views: Vec<usize> = (0..graph.views).filter(|v| centers[*v].is_some()).collect();
     let mut block_of = vec![0u32; graph.views];
     views.iter().zip(0..).for_each(|(v, n)| block_of[*v] = n);
-    let usable = edges.edges().iter().zip(&baselines).filter(|(e, _)| centers[e.a].is_some());
+    let usable = edges.edges().iter().zip(&baselines).filter(|(e, (baseline, _))| is_plausible(e, baseline));
     let (blocks, items): (Vec<[u32; 2]>, Vec<_>) = usable.map(|(e, b)| ([block_of[e.a], block_of[e.b]], *b)).unzip();
     let start: Vec<f64> = views.iter().filter_map(|v| centers[*v]).flat_map(|c| [c.x, c.y, c.z]).collect();
     let solved = (|| {
@@ -220,6 +242,31 @@ mod tests {
             // baselines of some units.
             let off = (centers[v].unwrap() - centers[0].unwrap()) - (center(v) - center(0));
             assert!(off.norm() < 0.2, "{v}: {off}");
+        }
+    }
+
+    #[test]
+    fn accidental_links_of_views_far_apart_do_not_fold_a_long_walk() {
+        let center = |v: usize| Point3::new(v as f64, 0.2 * (v as f64 * 0.3).sin(), 0.0);
+        // Each view has pairs with the next three.
+        let near =
+            (0..60).flat_map(|a| (a + 1..60.min(a + 4)).map(move |b| (a, b, 2000 / (b - a), center(b) - center(a))));
+        // And those of half the walk seem to be near views 30 later, by a few matches on a facade that looks alike.
+        let accidental = (0..30).flat_map(|a| (0..3).map(move |k| (a, a + 30 + k, 25)));
+        let accidental = accidental.filter(|l| l.1 < 60).map(|(a, b, n)| (a, b, n, Vector3::new(1.0, 0.0, 0.1)));
+        let links: Vec<(usize, usize, usize, Vector3<f64>)> = near.chain(accidental).collect();
+        let link = |(pair, l): (usize, &(usize, usize, usize, Vector3<f64>))| {
+            let pose = Pose::new(Rotation3::identity(), -l.3.normalize());
+            Link { pair, a: l.0, b: l.1, pose, matches: l.2 }
+        };
+        let graph = ViewGraph { views: 60, links: links.iter().enumerate().map(link).collect() };
+        let lengths: Vec<Option<f64>> = links.iter().map(|l| Some(l.3.norm())).collect();
+        let stage = Stage::new(&Silent, "test", 1).unwrap();
+        let centers = centers_from_baselines(&graph, &[Some(Rotation3::identity()); 60], &lengths, &stage).unwrap();
+        for v in 0..60 {
+            // All other baselines are exact.
+            let error = (centers[v].unwrap() - centers[0].unwrap()) - (center(v) - center(0));
+            assert!(error.norm() < 1e-6, "{v}: {error}");
         }
     }
 

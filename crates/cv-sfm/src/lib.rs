@@ -71,6 +71,7 @@ mod rotation_averaging;
 mod scene;
 mod tracks;
 mod translation_direction;
+mod tree_paths;
 mod triangulate_track;
 mod view_graph;
 mod view_pair;

@@ -2,14 +2,16 @@
 
 use crate::complete::FeatureDistance;
 use crate::focal_length::initial_cameras;
-use crate::incremental::{extend, initialize};
+use crate::incremental::{extend, growing_limits, initialize};
 use crate::initial_pair::initial_pairs;
 use crate::known_poses::register_known_poses;
 use crate::model::{SfmModel, ViewOutcome};
+use crate::model_parts::keep_largest_consistent_component;
 use crate::pair_scales::{Distances, measure_distances};
 use crate::refine_model::refine_model;
 use crate::repeated_structure::reject_repeated_structure;
 use crate::scene::Scene;
+use crate::triangulate_track::update_tracks;
 use crate::view_graph::{RefusedPair, ViewGraph};
 use crate::{CameraKnowledge, PairMatches, SfmView, Tracks, ViewPairModel, global};
 use cv_core::{Camera, Cancelled, OptionError, Pose, Progress, Stage};
@@ -372,7 +374,15 @@ impl Reconstruction<'_, '_> {
     /// Registers all views that the scene can take up and refines it; `None` where too few observations agree with it.
     fn complete_model(&mut self, solver: Solver) -> Result<Option<Candidate>, Cancelled> {
         let mut outcomes = self.outcomes.clone();
-        extend(&mut self.scene, &self.is_registered, self.options, &mut outcomes, &self.stage)?;
+        let pairs: Vec<(usize, usize)> = self.pairs.iter().map(|p| (p.a, p.b)).collect();
+        for _ in 0..MAX_EXTENSIONS {
+            extend(&mut self.scene, &self.is_registered, self.options, &mut outcomes, &self.stage)?;
+            if !keep_largest_consistent_component(&mut self.scene, &pairs, 1, self.options.min_model_size) {
+                break;
+            }
+            let all: Vec<usize> = (0..self.scene.tracks.len()).collect();
+            update_tracks(&mut self.scene, growing_limits(self.options), &all);
+        }
         refine_model(&mut self.scene, self.input.feature_distance, self.options, &self.stage)?;
         let (agree, of) = self.scene.support();
         if (agree as f64) < MIN_SUPPORT * of as f64 {
@@ -387,6 +397,9 @@ impl Reconstruction<'_, '_> {
 /// Minimum ratio of inliers among the matched keypoints of a model's views. Of fountain-P11, sceaux, templeRing and a
 /// drive 82 to 99 % agree; with a wrong focal length 1 %.
 const MIN_SUPPORT: f64 = 0.3;
+/// Maximum number of times that a model is extended: its parts may turn out to be inconsistent where they meet, and only
+/// the largest is kept then.
+const MAX_EXTENSIONS: usize = 2;
 /// Maximum number of initial pairs that are tried while models have fewer than half of the views.
 const MAX_INITIAL_PAIRS: usize = 4;
 fn validate(input: &SfmInput<'_>, options: &SfmOptions) -> Result<(), SfmError> {
