@@ -4,7 +4,7 @@
 use crate::SfmOptions;
 use crate::bundle::{BundlePlan, LensFreedom, adjust};
 use crate::global_positions::{adjust_rays, centers_from_baselines};
-use crate::model_parts::keep_largest_consistent_component;
+use crate::model_parts::{Consistency, keep_largest_consistent_component};
 use crate::pair_scales::{Distances, estimate_baselines};
 use crate::rotation_averaging::average_rotations;
 use crate::scene::Scene;
@@ -85,7 +85,7 @@ pub(crate) fn estimate_poses(
     // So are components in an inconsistent position or scale: on a rendered street of 50 views, three components
     // overlapped in scales of 0.7 to 1.
     let pairs: Vec<(usize, usize)> = graph.links.iter().map(|l| (l.a, l.b)).collect();
-    if keep_largest_consistent_component(scene, &pairs, options.min_pose_inliers, 1) {
+    if !keep_largest_consistent_component(scene, &pairs, Consistency::Inliers, options.min_pose_inliers, 1).is_empty() {
         update_tracks(scene, limits(0.0), &all);
     }
     Ok(scene.registered().len() > 1)

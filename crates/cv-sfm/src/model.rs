@@ -99,4 +99,12 @@ pub enum ViewOutcome {
         /// Number that is needed.
         needed: usize,
     },
+    /// It was registered by some matches, but most other observations contradict its pose: it, or its part of the model,
+    /// shows another place that looks alike.
+    Contradicted {
+        /// Points of the model in its field of view that it observes.
+        agree: usize,
+        /// All of them.
+        of: usize,
+    },
 }

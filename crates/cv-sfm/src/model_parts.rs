@@ -2,66 +2,123 @@
 
 use crate::scene::Scene;
 use crate::tree_paths::TreePaths;
+use cv_core::{Point2, Vector3};
 use cv_geometry::{PairEdge, PairGraph};
 use cv_parallel::prelude::*;
 
-/// Counts of the tracks that both views of a pair observe.
-#[derive(Debug, Clone, Copy, Default)]
-struct SharedTracks {
-    /// Both observations are inliers.
-    consistent: usize,
-    /// One observation is an inlier, the other is an outlier.
-    inconsistent: usize,
+/// By which observations the views of a pair are judged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Consistency {
+    /// Of the tracks that both views observe and that are inliers in one, those that are inliers in both. A component in
+    /// a wrong position or scale has points of its own, which are outliers in the others. At least half must be.
+    Inliers,
+    /// Of the points of one view that the other one sees under nearly the same angle and at nearly the same distance,
+    /// those it observes. A view of another place that looks alike has few matches there: one in 25 of a rendered street,
+    /// where all right pairs of five sets have one in eight or more, mostly one in two. At least a tenth must be. Of
+    /// completed tracks only.
+    VisiblePoints,
 }
 
-/// Removes the poses of all consistent components of at least `min_views` views but the largest. A component in a wrong
-/// position or scale has points of its own, which are inliers in its views and outliers in the others.
+impl Consistency {
+    /// Returns the smallest ratio of observations that agree, as the reciprocal.
+    fn max_factor(self) -> usize {
+        match self {
+            Self::Inliers => 2,
+            Self::VisiblePoints => 10,
+        }
+    }
+}
+
+/// Largest angle at a visible point between the directions to the two views, in radians.
+const MAX_VISIBLE_ANGLE: f64 = 0.2;
+/// Largest ratio of the distances of a visible point from the two views.
+const MAX_VISIBLE_RATIO: f64 = 4.0 / 3.0;
+/// Distance of a visible point from the image border, in pixels.
+const VISIBLE_BORDER: f64 = 5.0;
+
+/// Counts of observations of a pair of views, or of pairs.
+#[derive(Debug, Clone, Copy, Default)]
+struct Agreement {
+    /// Those that agree.
+    agree: usize,
+    /// All.
+    of: usize,
+}
+
+/// A view that was removed from a model, with the agreement of its part with the others.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct RemovedView {
+    pub(crate) view: usize,
+    pub(crate) agree: usize,
+    pub(crate) of: usize,
+}
+
+/// Removes the poses of all consistent components of at least `min_views` views but the largest.
 ///
 /// Pairs with at least `min_shared` tracks that are inliers in both views make a maximum spanning forest. An edge of it
-/// is cut if, over all `pairs` from one part to the other, more shared tracks are inliers in only one view than in both,
-/// the most contradicted edge first: a few accidental matches do not hold parts together that thousands of others
-/// contradict. Removed views can be registered again by the remaining points. Components in two scales that share a view
-/// are not separated: pairs with that view do not depend on the scale. Returns whether views were removed.
+/// is cut if, over all `pairs` from one part to the other, too few observations agree ([`Consistency`]), the most
+/// contradicted edge first: a few accidental matches do not hold parts together that thousands of others contradict.
+/// Removed views can be registered again by the remaining points. Components in two scales that share a view are not
+/// separated: pairs with that view do not depend on the scale. Returns the removed views.
 /// O(observations of the views of all pairs + pairs · views) for each cut.
 pub(crate) fn keep_largest_consistent_component(
     scene: &mut Scene<'_>,
     pairs: &[(usize, usize)],
+    consistency: Consistency,
     min_shared: usize,
     min_views: usize,
-) -> bool {
+) -> Vec<RemovedView> {
     let is_registered = |v: usize| scene.poses[v].is_some();
     let pairs: Vec<(usize, usize)> =
         pairs.iter().filter(|(a, b)| is_registered(*a) && is_registered(*b)).copied().collect();
-    let shared: Vec<SharedTracks> = pairs.par_iter().map(|(a, b)| count_shared_tracks(scene, *a, *b)).collect();
-    let consistent = |(&(a, b), shared): (&(usize, usize), &SharedTracks)| {
-        (shared.consistent >= min_shared).then_some(PairEdge { a, b, weight: shared.consistent as f64 })
+    let count = |&(a, b): &(usize, usize)| {
+        let shared = count_shared_tracks(scene, a, b);
+        let agreement = match consistency {
+            Consistency::Inliers => shared,
+            Consistency::VisiblePoints => {
+                let [one, other] = [count_visible_points(scene, a, b), count_visible_points(scene, b, a)];
+                Agreement { agree: one.agree + other.agree, of: one.of + other.of }
+            }
+        };
+        (shared.agree, agreement)
     };
-    let edges = pairs.iter().zip(&shared).filter_map(consistent).collect();
-    let Ok(graph) = PairGraph::new(scene.views.len(), edges) else { return false };
+    let counts: Vec<(usize, Agreement)> = pairs.par_iter().map(count).collect();
+    let edge = |(&(a, b), &(shared, _)): (&(usize, usize), &(usize, Agreement))| {
+        (shared >= min_shared).then_some(PairEdge { a, b, weight: shared as f64 })
+    };
+    let edges = pairs.iter().zip(&counts).filter_map(edge).collect();
+    let Ok(graph) = PairGraph::new(scene.views.len(), edges) else { return Vec::new() };
     let mut forest = graph.maximum_spanning_forest();
     let mut kept = Vec::new();
-    while let Some((edge, smaller_part)) = most_contradicted_edge(&graph, &forest, pairs.iter().zip(&shared)) {
+    let agreement: Vec<Agreement> = counts.iter().map(|c| c.1).collect();
+    while let Some((edge, smaller_part)) = most_contradicted_edge(&graph, &forest, &pairs, &agreement, consistency) {
         forest.retain(|e| *e != edge);
         if smaller_part < min_views {
             kept.push(edge);
         }
     }
     let kept = kept.iter().chain(&forest).map(|e| graph.edges()[*e]).collect();
-    let Ok(parts) = PairGraph::new(scene.views.len(), kept) else { return false };
-    let others = parts.connected_components().into_iter().skip(1).filter(|part| part.len() >= min_views);
-    let mut has_removed = false;
-    for view in others.flatten() {
-        has_removed |= scene.poses[view].take().is_some();
+    let Ok(parts) = PairGraph::new(scene.views.len(), kept) else { return Vec::new() };
+    let mut removed = Vec::new();
+    for part in parts.connected_components().into_iter().skip(1).filter(|part| part.len() >= min_views) {
+        // Nodes are ascending.
+        let is_across = |(a, b): &(usize, usize)| part.binary_search(a).is_ok() != part.binary_search(b).is_ok();
+        let across = pairs.iter().zip(&agreement).filter(|(pair, _)| is_across(pair));
+        let (agree, of) = across.fold((0, 0), |sum, (_, pair)| (sum.0 + pair.agree, sum.1 + pair.of));
+        let registered = part.iter().filter(|v| scene.poses[**v].take().is_some());
+        removed.extend(registered.map(|view| RemovedView { view: *view, agree, of }));
     }
-    has_removed
+    removed
 }
 
-/// Returns the edge of a forest between two parts whose pairs have most inconsistent shared tracks in excess of the
-/// consistent ones, and the number of nodes of the smaller part; `None` where none has more. O(pairs · nodes).
-fn most_contradicted_edge<'p>(
+/// Returns the edge of a forest between two parts whose pairs lack most observations that agree, and the number of nodes
+/// of the smaller part; `None` where none lacks any. O(pairs · nodes).
+fn most_contradicted_edge(
     graph: &PairGraph,
     forest: &[usize],
-    pairs: impl Iterator<Item = (&'p (usize, usize), &'p SharedTracks)>,
+    pairs: &[(usize, usize)],
+    agreement: &[Agreement],
+    consistency: Consistency,
 ) -> Option<(usize, usize)> {
     let nodes = graph.nodes();
     let mut paths = TreePaths::new(nodes);
@@ -76,35 +133,33 @@ fn most_contradicted_edge<'p>(
             steps.extend(of_tree);
         }
     }
-    // By node: the tracks across the edge to its parent, and the number of nodes from it on.
-    let mut across = vec![SharedTracks::default(); nodes];
-    for (&(a, b), shared) in pairs {
+    // By node: the agreement across the edge to its parent, and the number of nodes from it on.
+    let mut across = vec![Agreement::default(); nodes];
+    for (&(a, b), of_pair) in pairs.iter().zip(agreement) {
         for node in paths.between(a, b).into_iter().flatten() {
-            across[node].consistent += shared.consistent;
-            across[node].inconsistent += shared.inconsistent;
+            across[node].agree += of_pair.agree;
+            across[node].of += of_pair.of;
         }
     }
     let mut sizes = vec![1; nodes];
     steps.iter().rev().for_each(|step| sizes[step.parent] += sizes[step.node]);
-    let excess = |node: usize| across[node].inconsistent.saturating_sub(across[node].consistent);
-    let worst = steps.iter().max_by_key(|step| (excess(step.node), step.edge)).filter(|step| excess(step.node) > 0)?;
+    let lacking = |node: usize| across[node].of.saturating_sub(consistency.max_factor() * across[node].agree);
+    let worst =
+        steps.iter().max_by_key(|step| (lacking(step.node), step.edge)).filter(|step| lacking(step.node) > 0)?;
     let part = sizes[worst.node];
     Some((worst.edge, part.min(sizes[paths.root(worst.node)] - part)))
 }
 
-/// Counts the tracks with a point that both views observe.
-fn count_shared_tracks(scene: &Scene<'_>, a: usize, b: usize) -> SharedTracks {
+/// Counts the tracks that both views observe and that are inliers in one, and those that are inliers in both.
+fn count_shared_tracks(scene: &Scene<'_>, a: usize, b: usize) -> Agreement {
     // The observations of a view are sorted by track.
     let (mut first, mut second) = (scene.view_observations(a).peekable(), scene.view_observations(b).peekable());
-    let mut counts = SharedTracks::default();
+    let mut counts = Agreement::default();
     while let (Some(&i), Some(&j)) = (first.peek(), second.peek()) {
         let (s, t) = (scene.track_of(i), scene.track_of(j));
         if s == t {
-            match (scene.active[i], scene.active[j]) {
-                (true, true) => counts.consistent += 1,
-                (false, false) => {}
-                _ => counts.inconsistent += 1,
-            }
+            counts.agree += usize::from(scene.active[i] && scene.active[j]);
+            counts.of += usize::from(scene.active[i] || scene.active[j]);
         }
         if s <= t {
             first.next();
@@ -112,6 +167,43 @@ fn count_shared_tracks(scene: &Scene<'_>, a: usize, b: usize) -> SharedTracks {
         if t <= s {
             second.next();
         }
+    }
+    counts
+}
+
+/// Counts the points of view `from` that lie in the image of view `to` under nearly the same angle and at nearly the same
+/// distance, and those of them that `to` observes; no more points than `to` has keypoints in that part of its image.
+fn count_visible_points(scene: &Scene<'_>, from: usize, to: usize) -> Agreement {
+    let mut counts = Agreement::default();
+    let [Some(pose_from), Some(pose)] = [from, to].map(|v| scene.poses[v]) else { return counts };
+    let (center_from, center) = (pose_from.center(), pose.center());
+    let camera = scene.camera_of(to);
+    let (right, bottom) = (camera.width as f64 - 1.0 - VISIBLE_BORDER, camera.height as f64 - 1.0 - VISIBLE_BORDER);
+    let (mut low, mut high) = (Point2::new(right, bottom), Point2::new(VISIBLE_BORDER, VISIBLE_BORDER));
+    for track in scene.view_observations(from).filter(|i| scene.active[*i]).map(|i| scene.track_of(i)) {
+        let Some(point) = scene.points[track] else { continue };
+        let [one, other]: [Vector3<f64>; 2] = [point - center_from, point - center];
+        let ratio = one.norm() / other.norm();
+        let is_similar = (1.0 / MAX_VISIBLE_RATIO..=MAX_VISIBLE_RATIO).contains(&ratio);
+        if !is_similar || one.angle(&other) > MAX_VISIBLE_ANGLE {
+            continue;
+        }
+        let Some(at) = camera.project(&pose.transform(&point)) else { continue };
+        if !(VISIBLE_BORDER..=right).contains(&at.x) || !(VISIBLE_BORDER..=bottom).contains(&at.y) {
+            continue;
+        }
+        (low, high) = (low.inf(&at), high.sup(&at));
+        counts.of += 1;
+        counts.agree += usize::from(scene.tracks.range(track).any(|i| scene.view_of(i) == to && scene.active[i]));
+    }
+    // A blurred photograph has few keypoints.
+    let is_inside = |k: &cv_core::Keypoint| {
+        let at: Point2<f64> = k.position.cast();
+        (low.x..=high.x).contains(&at.x) && (low.y..=high.y).contains(&at.y)
+    };
+    if counts.agree * Consistency::VisiblePoints.max_factor() < counts.of {
+        let keypoints = scene.views[to].keypoints.iter().filter(|k| is_inside(k)).count();
+        counts.of = counts.of.min(keypoints.max(counts.agree));
     }
     counts
 }
@@ -124,78 +216,122 @@ mod tests {
     use cv_core::{Keypoint, Point2, Point3, Pose};
     use cv_synth::{FeatureViews, FeatureViewsOptions};
 
-    /// Registers all views with `poses`, keeps the largest consistent component, and returns its views.
-    fn kept(
-        truth: &FeatureViews,
-        poses: &[Pose],
-        accidental: &[[Point2<f64>; 2]],
-        limits: (usize, usize),
-    ) -> Vec<usize> {
-        let mut keypoints = truth.keypoints.clone();
-        let mut lists: Vec<Vec<Observation>> = vec![Vec::new(); truth.points.len()];
-        for (shown, view) in truth.point_indices.iter().zip(0..) {
-            shown.iter().zip(0..).for_each(|(p, keypoint)| lists[*p as usize].push(Observation { view, keypoint }));
-        }
-        lists.retain(|list| list.len() >= 2);
-        for pixels in accidental {
-            let observe = |(view, at): (usize, &Point2<f64>)| {
-                keypoints[view].push(*at);
-                Observation { view: view as u32, keypoint: keypoints[view].len() as u32 - 1 }
-            };
-            lists.push(ENDS.into_iter().zip(pixels).map(observe).collect());
-        }
-        let keypoints: Vec<Vec<Keypoint>> = (keypoints.iter())
-            .map(|view| view.iter().map(|p| Keypoint::new(p.x as f32, p.y as f32, 1.0)).collect())
-            .collect();
-        let views: Vec<SfmView<'_>> = keypoints.iter().map(|k| SfmView { camera: 0, keypoints: k }).collect();
-        let (cameras, knowledge) = ([truth.camera], [CameraKnowledge::Known]);
-        let mut scene = Scene::new(&views, &cameras, &knowledge, Tracks::from_lists(lists));
-        scene.poses = poses.iter().copied().map(Some).collect();
-        let all: Vec<usize> = (0..scene.tracks.len()).collect();
-        // As in a reconstruction: three standard deviations of the noise are a pixel.
-        update_tracks(&mut scene, PointLimits { error: 2.5, angle: 0.026 }, &all);
-        let mut pairs: Vec<(usize, usize)> = truth.pairs(30).into_iter().map(|(a, b, _)| (a, b)).collect();
-        pairs.push((ENDS[0], ENDS[1]));
-        let has_removed = keep_largest_consistent_component(&mut scene, &pairs, limits.0, limits.1);
-        assert_eq!(has_removed, scene.registered().len() < poses.len());
-        scene.registered()
+    /// Keypoints, tracks and pairs of the views of a walk.
+    struct Matched {
+        walk: FeatureViews,
+        keypoints: Vec<Vec<Point2<f64>>>,
+        tracks: Vec<Vec<Observation>>,
+        pairs: Vec<(usize, usize)>,
     }
 
-    /// The views with accidental matches.
-    const ENDS: [usize; 2] = [2, 21];
+    impl Matched {
+        fn new(points: usize) -> Self {
+            let walk = FeatureViews::new(&FeatureViewsOptions { views: 24, points, ..Default::default() });
+            let mut tracks: Vec<Vec<Observation>> = vec![Vec::new(); walk.points.len()];
+            for (shown, view) in walk.point_indices.iter().zip(0..) {
+                shown
+                    .iter()
+                    .zip(0..)
+                    .for_each(|(p, keypoint)| tracks[*p as usize].push(Observation { view, keypoint }));
+            }
+            let pairs = walk.pairs(30).into_iter().map(|(a, b, _)| (a, b)).collect();
+            Self { keypoints: walk.keypoints.clone(), walk, tracks, pairs }
+        }
+
+        /// Adds a keypoint to a view.
+        fn observe(&mut self, view: usize, at: Point2<f64>) -> Observation {
+            self.keypoints[view].push(at);
+            Observation { view: view as u32, keypoint: self.keypoints[view].len() as u32 - 1 }
+        }
+
+        /// Registers all views with `poses`, keeps the largest consistent component, and returns its views.
+        fn kept(&self, poses: &[Pose], consistency: Consistency, min_shared: usize, min_views: usize) -> Vec<usize> {
+            let keypoints: Vec<Vec<Keypoint>> = (self.keypoints.iter())
+                .map(|view| view.iter().map(|p| Keypoint::new(p.x as f32, p.y as f32, 1.0)).collect())
+                .collect();
+            let views: Vec<SfmView<'_>> = keypoints.iter().map(|k| SfmView { camera: 0, keypoints: k }).collect();
+            let (cameras, knowledge) = ([self.walk.camera], [CameraKnowledge::Known]);
+            let tracks = self.tracks.iter().filter(|list| list.len() >= 2).cloned();
+            let mut scene = Scene::new(&views, &cameras, &knowledge, Tracks::from_lists(tracks));
+            scene.poses = poses.iter().copied().map(Some).collect();
+            let all: Vec<usize> = (0..scene.tracks.len()).collect();
+            // As in a reconstruction: three standard deviations of the noise are a pixel.
+            update_tracks(&mut scene, PointLimits { error: 2.5, angle: 0.026 }, &all);
+            let removed =
+                keep_largest_consistent_component(&mut scene, &self.pairs, consistency, min_shared, min_views);
+            assert_eq!(removed.len() + scene.registered().len(), poses.len());
+            assert!(removed.iter().all(|r| r.agree * consistency.max_factor() < r.of), "{removed:?}");
+            scene.registered()
+        }
+    }
+
+    fn views(range: std::ops::Range<usize>) -> Vec<usize> {
+        range.collect()
+    }
 
     #[test]
     fn a_component_in_another_scale_is_removed_and_a_consistent_model_stays_whole() {
-        let truth = FeatureViews::new(&FeatureViewsOptions { views: 24, points: 4000, ..Default::default() });
+        let mut matched = Matched::new(4000);
         // From the fifteenth view on, the model is scaled by 2 about the center of the walk, which is the center of no
         // view: two components that share a view are consistent pairwise in any scale.
         let scaled = |v: usize| {
-            let pose = truth.poses[v];
+            let pose = matched.walk.poses[v];
             let factor = if v < 15 { 1.0 } else { 2.0 };
             Pose::new(pose.rotation, pose.translation * factor)
         };
-        let scaled: Vec<Pose> = (0..24).map(scaled).collect();
-        // Points on rays of the one view, in front of the other.
-        let [a, b] = ENDS.map(|v| scaled[v]);
-        let pixels = |k: usize| {
-            let [x, y] = [k % 40, k / 40].map(|n| 20.0 * n as f64);
-            let ray = truth.camera.normalize(Point2::new(x, y)).to_homogeneous();
-            // In the image or not: the adjustment does not care.
-            let at = (1..60).find_map(|depth| {
-                let point = a.inverse().transform(&Point3::from(ray * f64::from(depth)));
-                truth.camera.project(&b.transform(&point))
-            })?;
-            Some([Point2::new(x, y), at])
-        };
-        let accidental: Vec<[Point2<f64>; 2]> = (0..1200).filter_map(pixels).take(60).collect();
-        assert_eq!(accidental.len(), 60);
-        for limits in [(20, 1), (1, 3)] {
-            assert_eq!(kept(&truth, &truth.poses, &[], limits), (0..24).collect::<Vec<_>>());
-            assert_eq!(kept(&truth, &scaled, &[], limits), (0..15).collect::<Vec<_>>());
-            // Accidental matches that agree with the wrong scale do not hold the components together.
-            assert_eq!(kept(&truth, &scaled, &accidental, limits), (0..15).collect::<Vec<_>>());
+        let (right, scaled): (Vec<Pose>, Vec<Pose>) = (matched.walk.poses.clone(), (0..24).map(scaled).collect());
+        let judged = Consistency::Inliers;
+        for (min_shared, min_views) in [(20, 1), (1, 3)] {
+            assert_eq!(matched.kept(&right, judged, min_shared, min_views), views(0..24));
+            assert_eq!(matched.kept(&scaled, judged, min_shared, min_views), views(0..15));
         }
         // Parts of fewer views than the minimum stay.
-        assert_eq!(kept(&truth, &scaled, &[], (1, 10)), (0..24).collect::<Vec<_>>());
+        assert_eq!(matched.kept(&scaled, judged, 1, 10), views(0..24));
+        // Accidental matches that agree with the wrong scale do not hold the components together: points on rays of one
+        // view, in front of another.
+        let ends = [2, 21];
+        let [a, b] = ends.map(|v| scaled[v]);
+        let camera = matched.walk.camera;
+        for k in 0..60 {
+            let [x, y] = [k % 10, k / 10].map(|n| 80.0 * f64::from(n));
+            let ray = camera.normalize(Point2::new(x, y)).to_homogeneous();
+            // In the image or not: neither is checked.
+            let in_front = |depth: u32| {
+                let point = a.inverse().transform(&Point3::from(ray * f64::from(depth)));
+                camera.project(&b.transform(&point))
+            };
+            let pixels = [Point2::new(x, y), (1..60).find_map(in_front).unwrap()];
+            let track = [0, 1].map(|end| matched.observe(ends[end], pixels[end]));
+            matched.tracks.push(track.to_vec());
+        }
+        matched.pairs.push((ends[0], ends[1]));
+        for (min_shared, min_views) in [(20, 1), (1, 3)] {
+            assert_eq!(matched.kept(&scaled, judged, min_shared, min_views), views(0..15));
+        }
+    }
+
+    #[test]
+    fn a_view_of_another_place_that_looks_alike_is_removed() {
+        let mut matched = Matched::new(12_000);
+        let mut poses = matched.walk.poses.clone();
+        assert_eq!(matched.kept(&poses, Consistency::VisiblePoints, 1, 1), views(0..24));
+        // The last view is thought to be beside another one, by 20 of the points there; it lacks the views around it.
+        let beside = 8;
+        poses[23] = Pose::new(poses[beside].rotation, poses[beside].translation + Vector3::new(0.2, 0.0, 0.0));
+        matched.tracks.iter_mut().for_each(|track| track.retain(|o| o.view != 23));
+        matched.pairs.retain(|pair| pair.1 != 23);
+        matched.pairs.push((beside, 23));
+        let camera = matched.walk.camera;
+        let seen = |track: &usize| matched.tracks[*track].iter().any(|o| o.view as usize == beside);
+        let shown: Vec<usize> = (0..matched.tracks.len()).filter(seen).take(20).collect();
+        assert_eq!(shown.len(), 20);
+        for point in shown {
+            let at = camera.project(&poses[23].transform(&matched.walk.points[point])).unwrap();
+            let observation = matched.observe(23, at);
+            matched.tracks[point].push(observation);
+        }
+        // All its matches are inliers.
+        assert_eq!(matched.kept(&poses, Consistency::Inliers, 1, 1), views(0..24));
+        assert_eq!(matched.kept(&poses, Consistency::VisiblePoints, 1, 1), views(0..23));
     }
 }

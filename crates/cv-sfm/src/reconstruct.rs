@@ -6,7 +6,7 @@ use crate::incremental::{extend, growing_limits, initialize};
 use crate::initial_pair::initial_pairs;
 use crate::known_poses::register_known_poses;
 use crate::model::{SfmModel, ViewOutcome};
-use crate::model_parts::keep_largest_consistent_component;
+use crate::model_parts::{Consistency, RemovedView, keep_largest_consistent_component};
 use crate::pair_scales::{Distances, measure_distances};
 use crate::refine_model::refine_model;
 use crate::repeated_structure::reject_repeated_structure;
@@ -198,7 +198,7 @@ pub fn reconstruct_views_from(
     progress: &dyn Progress,
 ) -> Result<SfmOutcome, SfmError> {
     validate(input, options)?;
-    let cameras = initial_cameras(input);
+    let mut cameras = initial_cameras(input);
     let stage = Stage::new(progress, "register", input.views.len())?;
     let mut graph = None;
     let (mut refused, mut distances) = (Vec::new(), Vec::new());
@@ -259,6 +259,10 @@ pub fn reconstruct_views_from(
         for (v, _) in candidate.model.poses.iter().enumerate().filter(|(_, p)| p.is_some()) {
             state.is_registered[v] = true;
             state.outcomes[v] = ViewOutcome::Registered { model: models.len() };
+        }
+        if models.is_empty() {
+            // The others, of fewer views, determine intrinsics less well.
+            cameras = vec![candidate.model.cameras.clone()];
         }
         models.push(candidate.model);
         solvers.push(candidate.solver);
@@ -375,15 +379,32 @@ impl Reconstruction<'_, '_> {
     fn complete_model(&mut self, solver: Solver) -> Result<Option<Candidate>, Cancelled> {
         let mut outcomes = self.outcomes.clone();
         let pairs: Vec<(usize, usize)> = self.pairs.iter().map(|p| (p.a, p.b)).collect();
+        let all: Vec<usize> = (0..self.scene.tracks.len()).collect();
+        let note = |removed: &[RemovedView], outcomes: &mut [ViewOutcome]| {
+            for &RemovedView { view, agree, of } in removed {
+                outcomes[view] = ViewOutcome::Contradicted { agree, of };
+            }
+        };
         for _ in 0..MAX_EXTENSIONS {
             extend(&mut self.scene, &self.is_registered, self.options, &mut outcomes, &self.stage)?;
-            if !keep_largest_consistent_component(&mut self.scene, &pairs, 1, self.options.min_model_size) {
+            let min_views = self.options.min_model_size;
+            let removed =
+                keep_largest_consistent_component(&mut self.scene, &pairs, Consistency::Inliers, 1, min_views);
+            if removed.is_empty() {
                 break;
             }
-            let all: Vec<usize> = (0..self.scene.tracks.len()).collect();
+            note(&removed, &mut outcomes);
             update_tracks(&mut self.scene, growing_limits(self.options), &all);
         }
         refine_model(&mut self.scene, self.input.feature_distance, self.options, &self.stage)?;
+        // Without completion, views may lack observations of points that they see.
+        if self.input.feature_distance.is_some() {
+            let removed = keep_largest_consistent_component(&mut self.scene, &pairs, Consistency::VisiblePoints, 1, 1);
+            if !removed.is_empty() {
+                note(&removed, &mut outcomes);
+                refine_model(&mut self.scene, self.input.feature_distance, self.options, &self.stage)?;
+            }
+        }
         let (agree, of) = self.scene.support();
         if (agree as f64) < MIN_SUPPORT * of as f64 {
             self.rejected_support = Some((agree, of));

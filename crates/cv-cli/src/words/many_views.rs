@@ -20,6 +20,9 @@ pub(crate) fn left_out(outcome: &ViewOutcome) -> Option<String> {
         ViewOutcome::NoPose { seen, agree, needed } => Some(format!(
             "{agree} of its {seen} correspondences to points of the model are inliers of a pose, {needed} are needed: repeated structure or moving objects"
         )),
+        ViewOutcome::Contradicted { agree, of } => Some(format!(
+            "it shows only {agree} of {of} points that should be in it: another place that looks alike; try photographs in between"
+        )),
     }
 }
 
