@@ -2,7 +2,7 @@
 
 use crate::scene::Scene;
 use crate::tree_paths::TreePaths;
-use cv_core::{Point2, Vector3};
+use cv_core::{Keypoint, Point2, Vector3, quantile};
 use cv_geometry::{PairEdge, PairGraph};
 use cv_parallel::prelude::*;
 
@@ -12,8 +12,9 @@ pub(crate) enum Consistency {
     /// Of the tracks that both views observe and that are inliers in one, those that are inliers in both. A component in
     /// a wrong position or scale has points of its own, which are outliers in the others. At least half must be.
     Inliers,
-    /// Of the points of one view that the other one sees under nearly the same angle and at nearly the same distance,
-    /// those it observes. A view of another place that looks alike has few matches there: one in 25 of a rendered street,
+    /// Of the points of one view that the other one sees under nearly the same angle and at nearly the same distance, and
+    /// as features of the larger half of the scales it observes (a blurred photograph has no small ones), those it
+    /// observes. A view of another place that looks alike has few matches there: one in 25 of a rendered street,
     /// where all right pairs of five sets have one in eight or more, mostly one in two. At least a tenth must be. Of
     /// completed tracks only.
     VisiblePoints,
@@ -43,6 +44,23 @@ struct Agreement {
     agree: usize,
     /// All.
     of: usize,
+    /// Tracks that are inliers in both views.
+    shared: usize,
+}
+
+impl Agreement {
+    fn add(&mut self, other: &Self) {
+        self.agree += other.agree;
+        self.of += other.of;
+        self.shared += other.shared;
+    }
+
+    /// Returns the number of observations that contradict in excess of those that [`Consistency`] allows; 0 where there
+    /// are fewer than shared tracks, too few to judge by: views at large angles see no points alike.
+    fn lacking(&self, consistency: Consistency) -> usize {
+        let is_judged = self.of >= self.shared;
+        if is_judged { self.of.saturating_sub(consistency.max_factor() * self.agree) } else { 0 }
+    }
 }
 
 /// A view that was removed from a model, with the agreement of its part with the others.
@@ -71,26 +89,27 @@ pub(crate) fn keep_largest_consistent_component(
     let is_registered = |v: usize| scene.poses[v].is_some();
     let pairs: Vec<(usize, usize)> =
         pairs.iter().filter(|(a, b)| is_registered(*a) && is_registered(*b)).copied().collect();
+    let min_scales: Vec<f32> = (0..scene.views.len()).into_par_iter().map(|v| median_scale(scene, v)).collect();
     let count = |&(a, b): &(usize, usize)| {
         let shared = count_shared_tracks(scene, a, b);
-        let agreement = match consistency {
+        match consistency {
             Consistency::Inliers => shared,
             Consistency::VisiblePoints => {
-                let [one, other] = [count_visible_points(scene, a, b), count_visible_points(scene, b, a)];
-                Agreement { agree: one.agree + other.agree, of: one.of + other.of }
+                let count = |from, to| count_visible_points(scene, from, to, min_scales[to]);
+                let mut both = Agreement { shared: shared.shared, ..count(a, b) };
+                both.add(&count(b, a));
+                both
             }
-        };
-        (shared.agree, agreement)
+        }
     };
-    let counts: Vec<(usize, Agreement)> = pairs.par_iter().map(count).collect();
-    let edge = |(&(a, b), &(shared, _)): (&(usize, usize), &(usize, Agreement))| {
-        (shared >= min_shared).then_some(PairEdge { a, b, weight: shared as f64 })
+    let agreement: Vec<Agreement> = pairs.par_iter().map(count).collect();
+    let edge = |(&(a, b), of_pair): (&(usize, usize), &Agreement)| {
+        (of_pair.shared >= min_shared).then_some(PairEdge { a, b, weight: of_pair.shared as f64 })
     };
-    let edges = pairs.iter().zip(&counts).filter_map(edge).collect();
+    let edges = pairs.iter().zip(&agreement).filter_map(edge).collect();
     let Ok(graph) = PairGraph::new(scene.views.len(), edges) else { return Vec::new() };
     let mut forest = graph.maximum_spanning_forest();
     let mut kept = Vec::new();
-    let agreement: Vec<Agreement> = counts.iter().map(|c| c.1).collect();
     while let Some((edge, smaller_part)) = most_contradicted_edge(&graph, &forest, &pairs, &agreement, consistency) {
         forest.retain(|e| *e != edge);
         if smaller_part < min_views {
@@ -103,10 +122,14 @@ pub(crate) fn keep_largest_consistent_component(
     for part in parts.connected_components().into_iter().skip(1).filter(|part| part.len() >= min_views) {
         // Nodes are ascending.
         let is_across = |(a, b): &(usize, usize)| part.binary_search(a).is_ok() != part.binary_search(b).is_ok();
-        let across = pairs.iter().zip(&agreement).filter(|(pair, _)| is_across(pair));
-        let (agree, of) = across.fold((0, 0), |sum, (_, pair)| (sum.0 + pair.agree, sum.1 + pair.of));
+        let mut across = Agreement::default();
+        pairs.iter().zip(&agreement).filter(|(pair, _)| is_across(pair)).for_each(|(_, of_pair)| across.add(of_pair));
+        // A view may share tracks only by way of views that are not registered.
+        if consistency == Consistency::VisiblePoints && across.lacking(consistency) == 0 {
+            continue;
+        }
         let registered = part.iter().filter(|v| scene.poses[**v].take().is_some());
-        removed.extend(registered.map(|view| RemovedView { view: *view, agree, of }));
+        removed.extend(registered.map(|view| RemovedView { view: *view, agree: across.agree, of: across.of }));
     }
     removed
 }
@@ -137,13 +160,12 @@ fn most_contradicted_edge(
     let mut across = vec![Agreement::default(); nodes];
     for (&(a, b), of_pair) in pairs.iter().zip(agreement) {
         for node in paths.between(a, b).into_iter().flatten() {
-            across[node].agree += of_pair.agree;
-            across[node].of += of_pair.of;
+            across[node].add(of_pair);
         }
     }
     let mut sizes = vec![1; nodes];
     steps.iter().rev().for_each(|step| sizes[step.parent] += sizes[step.node]);
-    let lacking = |node: usize| across[node].of.saturating_sub(consistency.max_factor() * across[node].agree);
+    let lacking = |node: usize| across[node].lacking(consistency);
     let worst =
         steps.iter().max_by_key(|step| (lacking(step.node), step.edge)).filter(|step| lacking(step.node) > 0)?;
     let part = sizes[worst.node];
@@ -160,6 +182,7 @@ fn count_shared_tracks(scene: &Scene<'_>, a: usize, b: usize) -> Agreement {
         if s == t {
             counts.agree += usize::from(scene.active[i] && scene.active[j]);
             counts.of += usize::from(scene.active[i] || scene.active[j]);
+            counts.shared = counts.agree;
         }
         if s <= t {
             first.next();
@@ -171,21 +194,31 @@ fn count_shared_tracks(scene: &Scene<'_>, a: usize, b: usize) -> Agreement {
     counts
 }
 
+/// Returns the median scale of the keypoints of a view that are inliers; 0 without any.
+fn median_scale(scene: &Scene<'_>, view: usize) -> f32 {
+    let inliers = scene.view_observations(view).filter(|i| scene.active[*i]);
+    let mut scales: Vec<f64> = inliers.map(|i| f64::from(scene.keypoint(i).scale)).collect();
+    quantile(&mut scales, 0.5).unwrap_or(0.0) as f32
+}
+
 /// Counts the points of view `from` that lie in the image of view `to` under nearly the same angle and at nearly the same
-/// distance, and those of them that `to` observes; no more points than `to` has keypoints in that part of its image.
-fn count_visible_points(scene: &Scene<'_>, from: usize, to: usize) -> Agreement {
+/// distance, with features of at least `min_scale`, and those of them that `to` observes; no more points than `to`
+/// has such keypoints in that part of its image.
+fn count_visible_points(scene: &Scene<'_>, from: usize, to: usize, min_scale: f32) -> Agreement {
     let mut counts = Agreement::default();
     let [Some(pose_from), Some(pose)] = [from, to].map(|v| scene.poses[v]) else { return counts };
     let (center_from, center) = (pose_from.center(), pose.center());
     let camera = scene.camera_of(to);
     let (right, bottom) = (camera.width as f64 - 1.0 - VISIBLE_BORDER, camera.height as f64 - 1.0 - VISIBLE_BORDER);
     let (mut low, mut high) = (Point2::new(right, bottom), Point2::new(VISIBLE_BORDER, VISIBLE_BORDER));
-    for track in scene.view_observations(from).filter(|i| scene.active[*i]).map(|i| scene.track_of(i)) {
+    for observation in scene.view_observations(from).filter(|i| scene.active[*i]) {
+        let track = scene.track_of(observation);
         let Some(point) = scene.points[track] else { continue };
         let [one, other]: [Vector3<f64>; 2] = [point - center_from, point - center];
         let ratio = one.norm() / other.norm();
         let is_similar = (1.0 / MAX_VISIBLE_RATIO..=MAX_VISIBLE_RATIO).contains(&ratio);
-        if !is_similar || one.angle(&other) > MAX_VISIBLE_ANGLE {
+        let is_large = scene.keypoint(observation).scale >= min_scale;
+        if !is_similar || !is_large || one.angle(&other) > MAX_VISIBLE_ANGLE {
             continue;
         }
         let Some(at) = camera.project(&pose.transform(&point)) else { continue };
@@ -196,10 +229,10 @@ fn count_visible_points(scene: &Scene<'_>, from: usize, to: usize) -> Agreement 
         counts.of += 1;
         counts.agree += usize::from(scene.tracks.range(track).any(|i| scene.view_of(i) == to && scene.active[i]));
     }
-    // A blurred photograph has few keypoints.
-    let is_inside = |k: &cv_core::Keypoint| {
+    // A photograph of low contrast has few keypoints.
+    let is_inside = |k: &Keypoint| {
         let at: Point2<f64> = k.position.cast();
-        (low.x..=high.x).contains(&at.x) && (low.y..=high.y).contains(&at.y)
+        k.scale >= min_scale && (low.x..=high.x).contains(&at.x) && (low.y..=high.y).contains(&at.y)
     };
     if counts.agree * Consistency::VisiblePoints.max_factor() < counts.of {
         let keypoints = scene.views[to].keypoints.iter().filter(|k| is_inside(k)).count();
@@ -213,7 +246,7 @@ mod tests {
     use super::*;
     use crate::triangulate_track::{PointLimits, update_tracks};
     use crate::{CameraKnowledge, Observation, SfmView, Tracks};
-    use cv_core::{Keypoint, Point2, Point3, Pose};
+    use cv_core::{Point3, Pose};
     use cv_synth::{FeatureViews, FeatureViewsOptions};
 
     /// Keypoints, tracks and pairs of the views of a walk.

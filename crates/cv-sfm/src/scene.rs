@@ -1,7 +1,7 @@
 //! The state of a reconstruction: cameras, poses, points and inlier observations.
 
 use crate::{CameraKnowledge, SfmView, Tracks};
-use cv_core::{Camera, Point2, Point3, Pose};
+use cv_core::{Camera, Keypoint, Point2, Point3, Pose};
 use cv_parallel::prelude::*;
 
 /// Cameras, poses, points and inlier observations of a reconstruction.
@@ -85,11 +85,17 @@ impl<'a> Scene<'a> {
         &self.cameras[self.views[view].camera]
     }
 
+    /// Returns the keypoint of an observation.
+    #[inline]
+    pub(crate) fn keypoint(&self, observation: usize) -> &Keypoint {
+        let o = self.tracks.observations()[observation];
+        &self.views[o.view as usize].keypoints[o.keypoint as usize]
+    }
+
     /// Returns the pixel of an observation.
     #[inline]
     pub(crate) fn pixel(&self, observation: usize) -> Point2<f64> {
-        let o = self.tracks.observations()[observation];
-        self.views[o.view as usize].keypoints[o.keypoint as usize].position.cast()
+        self.keypoint(observation).position.cast()
     }
 
     #[inline]
