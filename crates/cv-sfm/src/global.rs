@@ -85,7 +85,8 @@ pub(crate) fn estimate_poses(
     // So are components in an inconsistent position or scale: on a rendered street of 50 views, three components
     // overlapped in scales of 0.7 to 1.
     let pairs: Vec<(usize, usize)> = graph.links.iter().map(|l| (l.a, l.b)).collect();
-    if !keep_largest_consistent_component(scene, &pairs, Consistency::Inliers, options.min_pose_inliers, 1).is_empty() {
+    let all_parts = (options.min_pose_inliers, 1);
+    if !keep_largest_consistent_component(scene, &pairs, Consistency::Inliers, all_parts, stage)?.is_empty() {
         update_tracks(scene, limits(0.0), &all);
     }
     Ok(scene.registered().len() > 1)

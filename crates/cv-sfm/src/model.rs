@@ -102,9 +102,10 @@ pub enum ViewOutcome {
     /// It was registered by some matches, but most other observations contradict its pose: it, or its part of the model,
     /// shows another place that looks alike.
     Contradicted {
-        /// Points of the model in its field of view that it observes.
+        /// Observations that agree: points in its field of view that it observes, or tracks shared with the rest of the
+        /// model that are inliers in both.
         agree: usize,
-        /// All of them.
+        /// All of these points or tracks.
         of: usize,
     },
 }

@@ -2,9 +2,10 @@
 
 use crate::scene::Scene;
 use crate::tree_paths::TreePaths;
-use cv_core::{Keypoint, Point2, Vector3, quantile};
+use cv_core::{Cancelled, Keypoint, Point2, Stage, Vector3, quantile};
 use cv_geometry::{PairEdge, PairGraph};
 use cv_parallel::prelude::*;
+use std::collections::BTreeSet;
 
 /// By which observations the views of a pair are judged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -14,18 +15,18 @@ pub(crate) enum Consistency {
     Inliers,
     /// Of the points of one view that the other one sees under nearly the same angle and at nearly the same distance, and
     /// as features of the larger half of the scales it observes (a blurred photograph has no small ones), those it
-    /// observes. A view of another place that looks alike has few matches there: one in 25 of a rendered street,
-    /// where all right pairs of five sets have one in eight or more, mostly one in two. At least a tenth must be. Of
+    /// observes. Views of another place that looks alike observe few: a thirtieth to an eighth on a rendered street, where
+    /// right ones of five public sets observe half, and with a wrong focal length a quarter. At least a sixth must be. Of
     /// completed tracks only.
     VisiblePoints,
 }
 
 impl Consistency {
-    /// Returns the smallest ratio of observations that agree, as the reciprocal.
-    fn max_factor(self) -> usize {
+    /// Returns the largest number of observations for each one that agrees.
+    fn max_for_one(self) -> usize {
         match self {
             Self::Inliers => 2,
-            Self::VisiblePoints => 10,
+            Self::VisiblePoints => 6,
         }
     }
 }
@@ -59,7 +60,7 @@ impl Agreement {
     /// are fewer than shared tracks, too few to judge by: views at large angles see no points alike.
     fn lacking(&self, consistency: Consistency) -> usize {
         let is_judged = self.of >= self.shared;
-        if is_judged { self.of.saturating_sub(consistency.max_factor() * self.agree) } else { 0 }
+        if is_judged { self.of.saturating_sub(consistency.max_for_one() * self.agree) } else { 0 }
     }
 }
 
@@ -78,36 +79,38 @@ pub(crate) struct RemovedView {
 /// contradicted edge first: a few accidental matches do not hold parts together that thousands of others contradict.
 /// Removed views can be registered again by the remaining points. Components in two scales that share a view are not
 /// separated: pairs with that view do not depend on the scale. Returns the removed views.
-/// O(observations of the views of all pairs + pairs · views) for each cut.
+/// O(observations of the views of all pairs + pairs · views for each cut).
+///
+/// # Errors
+/// [`Cancelled`].
 pub(crate) fn keep_largest_consistent_component(
     scene: &mut Scene<'_>,
     pairs: &[(usize, usize)],
     consistency: Consistency,
-    min_shared: usize,
-    min_views: usize,
-) -> Vec<RemovedView> {
+    (min_shared, min_views): (usize, usize),
+    stage: &Stage<'_>,
+) -> Result<Vec<RemovedView>, Cancelled> {
     let is_registered = |v: usize| scene.poses[v].is_some();
     let pairs: Vec<(usize, usize)> =
         pairs.iter().filter(|(a, b)| is_registered(*a) && is_registered(*b)).copied().collect();
-    let min_scales: Vec<f32> = (0..scene.views.len()).into_par_iter().map(|v| median_scale(scene, v)).collect();
-    let count = |&(a, b): &(usize, usize)| {
-        let shared = count_shared_tracks(scene, a, b);
-        match consistency {
-            Consistency::Inliers => shared,
-            Consistency::VisiblePoints => {
-                let count = |from, to| count_visible_points(scene, from, to, min_scales[to]);
-                let mut both = Agreement { shared: shared.shared, ..count(a, b) };
-                both.add(&count(b, a));
-                both
-            }
-        }
+    let min_scales: Vec<f32> = match consistency {
+        Consistency::Inliers => Vec::new(),
+        Consistency::VisiblePoints => (0..scene.views.len()).into_par_iter().map(|v| median_scale(scene, v)).collect(),
     };
-    let agreement: Vec<Agreement> = pairs.par_iter().map(count).collect();
+    let count = |&(a, b): &(usize, usize)| {
+        stage.check()?;
+        let shared = count_shared_tracks(scene, a, b);
+        let [Some(of_a), Some(of_b)] = [a, b].map(|v| min_scales.get(v)) else { return Ok(shared) };
+        let mut visible = Agreement { shared: shared.shared, ..count_visible_points(scene, b, a, *of_a) };
+        visible.add(&count_visible_points(scene, a, b, *of_b));
+        Ok(visible)
+    };
+    let agreement: Vec<Agreement> = pairs.par_iter().map(count).try_collect()?;
     let edge = |(&(a, b), of_pair): (&(usize, usize), &Agreement)| {
         (of_pair.shared >= min_shared).then_some(PairEdge { a, b, weight: of_pair.shared as f64 })
     };
     let edges = pairs.iter().zip(&agreement).filter_map(edge).collect();
-    let Ok(graph) = PairGraph::new(scene.views.len(), edges) else { return Vec::new() };
+    let Ok(graph) = PairGraph::new(scene.views.len(), edges) else { return Ok(Vec::new()) };
     let mut forest = graph.maximum_spanning_forest();
     let mut kept = Vec::new();
     while let Some((edge, smaller_part)) = most_contradicted_edge(&graph, &forest, &pairs, &agreement, consistency) {
@@ -117,21 +120,34 @@ pub(crate) fn keep_largest_consistent_component(
         }
     }
     let kept = kept.iter().chain(&forest).map(|e| graph.edges()[*e]).collect();
-    let Ok(parts) = PairGraph::new(scene.views.len(), kept) else { return Vec::new() };
+    let Ok(parts) = PairGraph::new(scene.views.len(), kept) else { return Ok(Vec::new()) };
     let mut removed = Vec::new();
     for part in parts.connected_components().into_iter().skip(1).filter(|part| part.len() >= min_views) {
         // Nodes are ascending.
         let is_across = |(a, b): &(usize, usize)| part.binary_search(a).is_ok() != part.binary_search(b).is_ok();
         let mut across = Agreement::default();
         pairs.iter().zip(&agreement).filter(|(pair, _)| is_across(pair)).for_each(|(_, of_pair)| across.add(of_pair));
-        // A view may share tracks only by way of views that are not registered.
+        // Parts may be unconnected without a contradiction.
         if consistency == Consistency::VisiblePoints && across.lacking(consistency) == 0 {
             continue;
         }
         let registered = part.iter().filter(|v| scene.poses[**v].take().is_some());
         removed.extend(registered.map(|view| RemovedView { view: *view, agree: across.agree, of: across.of }));
     }
-    removed
+    Ok(removed)
+}
+
+/// Returns the pairs of views that share inlier tracks, ordered: also those that are no verified pairs, but whose matches
+/// with further views make common tracks. O(sum of the squared track lengths).
+pub(crate) fn covisible_pairs(scene: &Scene<'_>) -> Vec<(usize, usize)> {
+    let mut pairs = BTreeSet::new();
+    for track in 0..scene.points.len() {
+        let inliers = || scene.tracks.range(track).filter(|i| scene.active[*i]).map(|i| scene.view_of(i));
+        for (n, a) in inliers().enumerate() {
+            pairs.extend(inliers().skip(n + 1).filter(|b| *b != a).map(|b| (a.min(b), a.max(b))));
+        }
+    }
+    pairs.into_iter().collect()
 }
 
 /// Returns the edge of a forest between two parts whose pairs lack most observations that agree, and the number of nodes
@@ -234,7 +250,7 @@ fn count_visible_points(scene: &Scene<'_>, from: usize, to: usize, min_scale: f3
         let at: Point2<f64> = k.position.cast();
         k.scale >= min_scale && (low.x..=high.x).contains(&at.x) && (low.y..=high.y).contains(&at.y)
     };
-    if counts.agree * Consistency::VisiblePoints.max_factor() < counts.of {
+    if counts.agree * Consistency::VisiblePoints.max_for_one() < counts.of {
         let keypoints = scene.views[to].keypoints.iter().filter(|k| is_inside(k)).count();
         counts.of = counts.of.min(keypoints.max(counts.agree));
     }
@@ -246,7 +262,7 @@ mod tests {
     use super::*;
     use crate::triangulate_track::{PointLimits, update_tracks};
     use crate::{CameraKnowledge, Observation, SfmView, Tracks};
-    use cv_core::{Point3, Pose};
+    use cv_core::{Point3, Pose, Silent};
     use cv_synth::{FeatureViews, FeatureViewsOptions};
 
     /// Keypoints, tracks and pairs of the views of a walk.
@@ -290,10 +306,14 @@ mod tests {
             let all: Vec<usize> = (0..scene.tracks.len()).collect();
             // As in a reconstruction: three standard deviations of the noise are a pixel.
             update_tracks(&mut scene, PointLimits { error: 2.5, angle: 0.026 }, &all);
-            let removed =
-                keep_largest_consistent_component(&mut scene, &self.pairs, consistency, min_shared, min_views);
+            let (limits, stage) = ((min_shared, min_views), Stage::new(&Silent, "test", 1).unwrap());
+            let pairs = match consistency {
+                Consistency::Inliers => self.pairs.clone(),
+                Consistency::VisiblePoints => covisible_pairs(&scene),
+            };
+            let removed = keep_largest_consistent_component(&mut scene, &pairs, consistency, limits, &stage).unwrap();
             assert_eq!(removed.len() + scene.registered().len(), poses.len());
-            assert!(removed.iter().all(|r| r.agree * consistency.max_factor() < r.of), "{removed:?}");
+            assert!(removed.iter().all(|r| r.agree * consistency.max_for_one() < r.of), "{removed:?}");
             scene.registered()
         }
     }

@@ -6,7 +6,7 @@ use crate::incremental::{extend, growing_limits, initialize};
 use crate::initial_pair::initial_pairs;
 use crate::known_poses::register_known_poses;
 use crate::model::{SfmModel, ViewOutcome};
-use crate::model_parts::{Consistency, RemovedView, keep_largest_consistent_component};
+use crate::model_parts::{Consistency, RemovedView, covisible_pairs, keep_largest_consistent_component};
 use crate::pair_scales::{Distances, measure_distances};
 use crate::refine_model::refine_model;
 use crate::repeated_structure::reject_repeated_structure;
@@ -380,28 +380,19 @@ impl Reconstruction<'_, '_> {
         let mut outcomes = self.outcomes.clone();
         let pairs: Vec<(usize, usize)> = self.pairs.iter().map(|p| (p.a, p.b)).collect();
         let all: Vec<usize> = (0..self.scene.tracks.len()).collect();
-        let note = |removed: &[RemovedView], outcomes: &mut [ViewOutcome]| {
-            for &RemovedView { view, agree, of } in removed {
-                outcomes[view] = ViewOutcome::Contradicted { agree, of };
-            }
-        };
         for _ in 0..MAX_EXTENSIONS {
             extend(&mut self.scene, &self.is_registered, self.options, &mut outcomes, &self.stage)?;
-            let min_views = self.options.min_model_size;
-            let removed =
-                keep_largest_consistent_component(&mut self.scene, &pairs, Consistency::Inliers, 1, min_views);
-            if removed.is_empty() {
+            let limits = (1, self.options.min_model_size);
+            if !self.remove_inconsistent_parts(&pairs, Consistency::Inliers, limits, &mut outcomes)? {
                 break;
             }
-            note(&removed, &mut outcomes);
             update_tracks(&mut self.scene, growing_limits(self.options), &all);
         }
         refine_model(&mut self.scene, self.input.feature_distance, self.options, &self.stage)?;
         // Without completion, views may lack observations of points that they see.
         if self.input.feature_distance.is_some() {
-            let removed = keep_largest_consistent_component(&mut self.scene, &pairs, Consistency::VisiblePoints, 1, 1);
-            if !removed.is_empty() {
-                note(&removed, &mut outcomes);
+            let pairs = covisible_pairs(&self.scene);
+            if self.remove_inconsistent_parts(&pairs, Consistency::VisiblePoints, (1, 1), &mut outcomes)? {
                 refine_model(&mut self.scene, self.input.feature_distance, self.options, &self.stage)?;
             }
         }
@@ -412,6 +403,22 @@ impl Reconstruction<'_, '_> {
         }
         let model = SfmModel::from_scene(&self.scene, self.options.min_point_views);
         Ok(Some(Candidate { model, solver, outcomes }))
+    }
+
+    /// Removes the views of inconsistent parts of the model ([`keep_largest_consistent_component`]) and sets their
+    /// outcomes; returns whether there are any.
+    fn remove_inconsistent_parts(
+        &mut self,
+        pairs: &[(usize, usize)],
+        consistency: Consistency,
+        limits: (usize, usize),
+        outcomes: &mut [ViewOutcome],
+    ) -> Result<bool, Cancelled> {
+        let removed = keep_largest_consistent_component(&mut self.scene, pairs, consistency, limits, &self.stage)?;
+        for &RemovedView { view, agree, of } in &removed {
+            outcomes[view] = ViewOutcome::Contradicted { agree, of };
+        }
+        Ok(!removed.is_empty())
     }
 }
 

@@ -9,11 +9,19 @@ use cv_pipeline::many_views::{CameraKnowledge, Observation, SfmModel};
 use cv_pipeline::{SfmCamera, SfmJobOptions, SfmPhoto, Silent, sfm};
 use cv_synth::{Scene, rotation_error};
 use nalgebra::Matrix3;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
 
 /// Largest error of a camera center after a similarity alignment, as a fraction of the scene's longest side.
 const MAX_CENTER_ERROR: f64 = 1e-3;
 /// Largest rotation error after alignment by the mean rotation, in degrees.
 const MAX_ROTATION_ERROR_DEG: f64 = 0.02;
+
+/// Largest error of a camera center of a model without wrong joints, in meters: a quarter of the distance between
+/// neighbors.
+const MAX_MISPLACEMENT: f64 = 0.5;
+/// Minimum percentage of photographs that are registered.
+const MIN_REGISTERED: f64 = 95.0;
 
 pub(super) fn room_12() -> Result<Vec<Check>> {
     check_walk(&Walk::new(Scene::room(1), Scene::room_walk(12)), 9.0)
@@ -33,6 +41,36 @@ pub(super) fn street_50() -> Result<Vec<Check>> {
 
 pub(super) fn street_200() -> Result<Vec<Check>> {
     check_walk(&Walk::new(Scene::street(1, 60, 0), Scene::street_walk(60, 200)), 360.0)
+}
+
+/// Random subsets of a walk along a street, with a known camera: many views lack their neighbors, and facades look alike.
+/// Views that overlap with no other may be left out, or make a model of their own, but no model may join places that are
+/// apart.
+pub(super) fn street_gaps() -> Result<Vec<Check>> {
+    let walk = Walk::new(Scene::street(1, 18, 0), Scene::street_walk(18, 50));
+    let known = SfmCamera { camera: walk.camera, knowledge: CameraKnowledge::Known };
+    let photos = walk.photos(&SfmJobOptions::default())?;
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let (mut wrong, mut registered, mut views) = (0, 0, 0);
+    for (subset, share) in [0.35, 0.5, 0.7].into_iter().cycle().take(12).enumerate() {
+        let kept: Vec<usize> =
+            (0..photos.len()).filter(|_| f64::from(random.next_u32()) < share * f64::from(u32::MAX)).collect();
+        let truth: Vec<Pose> = kept.iter().map(|v| walk.poses[*v]).collect();
+        let photos: Vec<SfmPhoto> = kept.iter().map(|v| photos[*v].clone()).collect();
+        let result = sfm(&photos, &[known], &SfmJobOptions::default(), &Silent)?;
+        let mut errors = Vec::new();
+        for model in &result.models {
+            errors.push(PoseErrors::of(model, &truth)?.center);
+            registered += model.registered();
+        }
+        views += kept.len();
+        wrong += errors.iter().filter(|error| **error > MAX_MISPLACEMENT).count();
+        println!("subset {subset}: {} photographs, largest center error of each model, m: {errors:.3?}", kept.len());
+    }
+    Ok(vec![
+        Check::at_most("models that join different places", f64::from(wrong as u32), 0.0),
+        Check::at_least("photographs registered, %", 100.0 * registered as f64 / views as f64, MIN_REGISTERED),
+    ])
 }
 
 /// Checks a walk with known and with unknown intrinsics; `side` is the scene's longest side in meters.

@@ -21,6 +21,7 @@ const JOBS: &[checks::Named<Job>] = &[
     ("room-50", accuracy::room_50),
     ("street-12", accuracy::street_12),
     ("street-50", accuracy::street_50),
+    ("street-gaps", accuracy::street_gaps),
     ("street-200", accuracy::street_200),
 ];
 
