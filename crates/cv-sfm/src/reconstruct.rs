@@ -172,8 +172,10 @@ pub enum SfmError {
 /// structure, are rejected first ([`SfmOutcome::refused`]). Poses are then estimated globally or incrementally
 /// ([`Solver`]): from the initial pair with most points at large triangulation angles, the next view is the one with
 /// most visible points, evenly spread over the image. Points are triangulated from whole tracks. After each
-/// registration a local bundle adjustment follows, and a global one when the model has grown. Views that no model
-/// contains start another one. O(observations) for each adjustment; a model of n views has O(log n) global ones.
+/// registration a local bundle adjustment follows, and a global one when the model has grown. Parts of a model that the
+/// matches across contradict, and, with [`SfmInput::feature_distance`], views that lack nearly all points in their field
+/// of view, are removed ([`ViewOutcome::Contradicted`]). Views that no model contains start another one. O(observations)
+/// for each adjustment; a model of n views has O(log n) global ones.
 ///
 /// # Errors
 /// [`SfmError`].
