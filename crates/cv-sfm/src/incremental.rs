@@ -103,12 +103,7 @@ pub(crate) fn extend(
 
 /// Returns the view and the views that share the most points with it.
 fn local_bundle_views(scene: &Scene<'_>, view: usize) -> Vec<usize> {
-    let mut shared = vec![0usize; scene.views.len()];
-    for i in scene.view_observations(view).filter(|i| scene.active[*i]) {
-        for j in scene.tracks.range(scene.track_of(i)).filter(|j| scene.active[*j]) {
-            shared[scene.view_of(j)] += 1;
-        }
-    }
+    let shared = scene.shared_inliers(view);
     let mut order: Vec<usize> = (0..shared.len()).filter(|v| *v != view && shared[*v] > 0).collect();
     order.sort_by(|a, b| shared[*b].cmp(&shared[*a]).then(a.cmp(b)));
     order.truncate(LOCAL_BUNDLE_VIEWS);

@@ -5,7 +5,6 @@ use crate::tree_paths::TreePaths;
 use cv_core::{Cancelled, Keypoint, Point2, Stage, Vector3, quantile};
 use cv_geometry::{PairEdge, PairGraph};
 use cv_parallel::prelude::*;
-use std::collections::BTreeSet;
 
 /// By which observations the views of a pair are judged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -65,7 +64,7 @@ impl Agreement {
 }
 
 /// A view that was removed from a model, with the agreement of its part with the others.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy)]
 pub(crate) struct RemovedView {
     pub(crate) view: usize,
     pub(crate) agree: usize,
@@ -138,16 +137,19 @@ pub(crate) fn keep_largest_consistent_component(
 }
 
 /// Returns the pairs of views that share inlier tracks, ordered: also those that are no verified pairs, but whose matches
-/// with further views make common tracks. O(sum of the squared track lengths).
-pub(crate) fn covisible_pairs(scene: &Scene<'_>) -> Vec<(usize, usize)> {
-    let mut pairs = BTreeSet::new();
-    for track in 0..scene.points.len() {
-        let inliers = || scene.tracks.range(track).filter(|i| scene.active[*i]).map(|i| scene.view_of(i));
-        for (n, a) in inliers().enumerate() {
-            pairs.extend(inliers().skip(n + 1).filter(|b| *b != a).map(|b| (a.min(b), a.max(b))));
-        }
-    }
-    pairs.into_iter().collect()
+/// with further views make common tracks. O(inliers · track length).
+///
+/// # Errors
+/// [`Cancelled`].
+pub(crate) fn covisible_pairs(scene: &Scene<'_>, stage: &Stage<'_>) -> Result<Vec<(usize, usize)>, Cancelled> {
+    let views = scene.views.len();
+    let with_later = |a: usize| {
+        stage.check()?;
+        let shared = scene.shared_inliers(a);
+        Ok((a + 1..views).filter(|b| shared[*b] > 0).map(|b| (a, b)).collect())
+    };
+    let pairs: Vec<Vec<(usize, usize)>> = (0..views).into_par_iter().map(with_later).try_collect()?;
+    Ok(pairs.concat())
 }
 
 /// Returns the edge of a forest between two parts whose pairs lack most observations that agree, and the number of nodes
@@ -309,7 +311,7 @@ mod tests {
             let (limits, stage) = ((min_shared, min_views), Stage::new(&Silent, "test", 1).unwrap());
             let pairs = match consistency {
                 Consistency::Inliers => self.pairs.clone(),
-                Consistency::VisiblePoints => covisible_pairs(&scene),
+                Consistency::VisiblePoints => covisible_pairs(&scene, &stage).unwrap(),
             };
             let removed = keep_largest_consistent_component(&mut scene, &pairs, consistency, limits, &stage).unwrap();
             assert_eq!(removed.len() + scene.registered().len(), poses.len());

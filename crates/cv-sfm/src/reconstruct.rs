@@ -393,7 +393,7 @@ impl Reconstruction<'_, '_> {
         refine_model(&mut self.scene, self.input.feature_distance, self.options, &self.stage)?;
         // Without completion, views may lack observations of points that they see.
         if self.input.feature_distance.is_some() {
-            let pairs = covisible_pairs(&self.scene);
+            let pairs = covisible_pairs(&self.scene, &self.stage)?;
             if self.remove_inconsistent_parts(&pairs, Consistency::VisiblePoints, (1, 1), &mut outcomes)? {
                 refine_model(&mut self.scene, self.input.feature_distance, self.options, &self.stage)?;
             }

@@ -128,6 +128,17 @@ impl<'a> Scene<'a> {
         self.tracks.range(track).filter_map(|i| Some((i, self.poses[self.view_of(i)].as_ref()?)))
     }
 
+    /// Returns for each view the number of its inliers in tracks that are inliers in `view` too. O(inliers · track length).
+    pub(crate) fn shared_inliers(&self, view: usize) -> Vec<usize> {
+        let mut shared = vec![0usize; self.views.len()];
+        for i in self.view_observations(view).filter(|i| self.active[*i]) {
+            for j in self.tracks.range(self.track_of(i)).filter(|j| self.active[*j]) {
+                shared[self.view_of(j)] += 1;
+            }
+        }
+        shared
+    }
+
     /// Returns the reprojection error of an observation in pixels; infinite for a point behind the camera.
     #[inline]
     pub(crate) fn reprojection_error(&self, observation: usize, pose: &Pose, point: &Point3<f64>) -> f64 {
