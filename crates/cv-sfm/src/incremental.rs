@@ -22,6 +22,19 @@ pub(crate) fn growing_limits(options: &SfmOptions) -> PointLimits {
 pub(crate) const GROWING_BUNDLE: BundlePlan<'static> =
     BundlePlan { free: None, lens: LensFreedom::Fixed, scale: 1.0, max_iterations: 6, tolerance: 1e-3 };
 
+/// Returns the same with intrinsics, to convergence and with a loss that is nearly quadratic for inliers: poses and
+/// points adapt to wrong intrinsics at nearly the same cost, so that they converge slowly, and not at all once the
+/// observations that contradict them are outliers.
+fn growing_bundle_with_intrinsics(options: &SfmOptions) -> BundlePlan<'static> {
+    BundlePlan {
+        lens: LensFreedom::Distortion,
+        scale: options.growing_error(),
+        max_iterations: 50,
+        tolerance: 1e-6,
+        ..GROWING_BUNDLE
+    }
+}
+
 /// Starts a model from an initial pair.
 ///
 /// # Errors
@@ -88,8 +101,8 @@ pub(crate) fn extend(
         let registered = scene.registered().len();
         if registered as f64 >= adjusted as f64 * options.growth || registered < 6 {
             let refinable = registered > 2 && scene.knowledge.iter().any(|k| !k.is_calibrated());
-            let lens = if refinable { LensFreedom::Distortion } else { LensFreedom::Fixed };
-            adjust(scene, &BundlePlan { lens, ..GROWING_BUNDLE }, stage)?;
+            let plan = if refinable { growing_bundle_with_intrinsics(options) } else { GROWING_BUNDLE };
+            adjust(scene, &plan, stage)?;
             update_tracks(scene, growing_limits(options), &all);
             adjusted = registered;
         } else {

@@ -37,6 +37,40 @@ impl Dataset {
         dataset
     }
 
+    /// Projects points into each view and verifies all pairs. Keypoints have 0.3 px of noise; `start` is what the
+    /// reconstruction knows of the camera.
+    fn of_points(points: &[Point3<f64>], poses: &[Pose], camera: &Camera, start: (CameraKnowledge, Camera)) -> Self {
+        let mut keypoints = vec![Vec::new(); poses.len()];
+        let mut of_point = vec![Vec::new(); poses.len()];
+        let size = (camera.width as f64, camera.height as f64);
+        for (n, point) in points.iter().enumerate() {
+            for (i, view) in keypoints.iter_mut().enumerate() {
+                let pixel = camera.project(&poses[i].transform(point));
+                let inside = pixel.filter(|q| (0.0..size.0).contains(&q.x) && (0.0..size.1).contains(&q.y));
+                of_point[i].push(inside.map(|q| {
+                    // An arbitrary direction for each observation.
+                    let (sin, cos) = ((n * poses.len() + i) as f64 * 2.4).sin_cos();
+                    view.push(Keypoint::new((q.x + 0.42 * cos) as f32, (q.y + 0.42 * sin) as f32, 1.0));
+                    view.len() as u32 - 1
+                }));
+            }
+        }
+        let mut dataset = Self {
+            cameras: vec![start.1],
+            knowledge: vec![start.0],
+            keypoints,
+            pairs: Vec::new(),
+            geometry: Vec::new(),
+        };
+        for (a, b) in (0..poses.len()).flat_map(|a| (a + 1..poses.len()).map(move |b| (a, b))) {
+            let both = of_point[a].iter().zip(&of_point[b]).filter_map(|(x, y)| Some(((*x)?, (*y)?)));
+            let matches: Vec<DMatch> =
+                both.map(|(query, train)| DMatch { query, train, distance: 0.1, ratio: 0.5 }).collect();
+            dataset.verify(a, b, &matches);
+        }
+        dataset
+    }
+
     fn verify(&mut self, a: usize, b: usize, matches: &[DMatch]) {
         let camera = (&self.cameras[0], &self.knowledge[0]);
         let keypoints = [&self.keypoints[a][..], &self.keypoints[b]];
@@ -205,39 +239,49 @@ fn disconnected_scenes_are_separate_models() {
 #[test]
 fn a_rotating_camera_gives_no_model() {
     let truth = walk(12);
-    let camera = truth.camera;
-    // Distant points, viewed from one center.
     let pose = |i: usize| {
         Pose::new(cv_core::Rotation3::new(cv_core::Vector3::y() * 0.1 * i as f64), cv_core::Vector3::zeros())
     };
-    let mut keypoints: Vec<Vec<Keypoint>> = vec![Vec::new(); 8];
-    let mut of_point: Vec<Vec<Option<u32>>> = vec![Vec::new(); 8];
-    for p in &truth.points {
-        let direction = (p - truth.poses[0].center()).normalize();
-        for (i, view) in keypoints.iter_mut().enumerate() {
-            let pixel = camera.project(&pose(i).transform(&Point3::from(direction * 10.0)));
-            let inside = pixel
-                .filter(|q| (0.0..camera.width as f64).contains(&q.x) && (0.0..camera.height as f64).contains(&q.y));
-            of_point[i].push(inside.map(|q| {
-                view.push(Keypoint::new(q.x as f32, q.y as f32, 1.0));
-                view.len() as u32 - 1
-            }));
-        }
-    }
-    let mut dataset = Dataset {
-        cameras: vec![camera],
-        knowledge: vec![CameraKnowledge::Known],
-        keypoints,
-        pairs: Vec::new(),
-        geometry: Vec::new(),
-    };
-    for (a, b) in (0..8).flat_map(|a| (a + 1..8).map(move |b| (a, b))) {
-        let both = of_point[a].iter().zip(&of_point[b]).filter_map(|(x, y)| Some(((*x)?, (*y)?)));
-        let matches: Vec<DMatch> =
-            both.map(|(query, train)| DMatch { query, train, distance: 0.1, ratio: 0.5 }).collect();
-        dataset.verify(a, b, &matches);
-    }
+    let poses: Vec<Pose> = (0..8).map(pose).collect();
+    // Distant points, viewed from one center.
+    let direction = |p: &Point3<f64>| Point3::from((p - truth.poses[0].center()).normalize() * 10.0);
+    let points: Vec<Point3<f64>> = truth.points.iter().map(direction).collect();
+    let dataset = Dataset::of_points(&points, &poses, &truth.camera, (CameraKnowledge::Known, truth.camera));
     assert!(matches!(dataset.solve(), Err(SfmError::NoInitialPair { .. })));
+}
+
+#[test]
+fn an_unknown_focal_length_is_estimated_around_an_object() {
+    // Twelve views of objects on a table, all from the same height at the same distance: two views whose optical axes
+    // intersect do not determine the focal length (Sturm, "On focal length calibration from two views", CVPR 2001).
+    let mut rng = 1u64;
+    let mut uniform = || {
+        rng = rng.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (rng >> 11) as f64 / (1u64 << 53) as f64
+    };
+    let points: Vec<Point3<f64>> = (0..1500)
+        .map(|i| {
+            let height = if i % 3 == 0 { 0.3 * uniform() } else { 0.0 };
+            Point3::new(1.2 * uniform() - 0.6, -height, 1.2 * uniform() - 0.6)
+        })
+        .collect();
+    let eye = |angle: f64| Point3::new(1.5 * angle.sin(), -0.7, -1.5 * angle.cos());
+    let pose = |i: usize| {
+        let angle = 0.2 * (i as f64 - 5.5);
+        Pose::look_at(eye(angle), Point3::new(0.0, -0.12, 0.0), cv_core::Vector3::y()).unwrap()
+    };
+    let poses: Vec<Pose> = (0..12).map(pose).collect();
+    let camera = Camera::from_focal(1000, 750, 780.0);
+    let start = Camera { distortion: cv_core::Distortion::radial(0.0, 0.0), ..Camera::from_focal(1000, 750, 1200.0) };
+    let dataset = Dataset::of_points(&points, &poses, &camera, (CameraKnowledge::Unknown, start));
+    let found = dataset.solve().unwrap();
+    assert_eq!(found.models[0].registered(), 12, "{:?}", found.views);
+    let focal = found.models[0].cameras[0].fx;
+    // The keypoint noise leaves a thousandth of the focal length. (And some pixels of the principal point, or tenths of
+    // a degree of a pitch common to all views, which the positions do not show.)
+    assert!((focal / camera.fx - 1.0).abs() < 5e-3, "{focal} of {}", camera.fx);
+    let (center, _) = errors(&found.models[0].poses, &poses);
+    assert!(center < MAX_CENTER_ERROR, "{center}");
 }
 
 #[test]
