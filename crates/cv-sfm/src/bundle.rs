@@ -27,11 +27,22 @@ pub(crate) enum LensFreedom {
     PrincipalPoint,
 }
 
+/// Which parameters of the poses are refined.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Motion {
+    /// Rotation and translation.
+    Full,
+    /// The rotation only; translations stay constant.
+    Rotation,
+}
+
 /// Free parameters and termination criteria of [`adjust`].
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct BundlePlan<'p> {
     /// Views whose poses are free; `None`: all registered views.
     pub(crate) free: Option<&'p [usize]>,
+    /// Which parameters of these poses are free.
+    pub(crate) motion: Motion,
     /// Which intrinsics are free.
     pub(crate) lens: LensFreedom,
     /// Scale of the Cauchy loss, in pixels.
@@ -347,6 +358,11 @@ impl Problem<'_> {
         let fixed: Vec<usize> = (0..views.len()).filter(|n| !free[views[*n]]).collect();
         for n in &fixed {
             adjustment.fix(poses, *n)?;
+        }
+        if plan.motion == Motion::Rotation {
+            for n in 0..views.len() {
+                adjustment.fix_parameters(poses, n, &[3, 4, 5])?;
+            }
         }
         let mut reference = None;
         if fixed.is_empty() {

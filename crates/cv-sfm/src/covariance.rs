@@ -1,6 +1,6 @@
 //! Covariances of the poses and points of a model.
 
-use crate::bundle::{BundlePlan, LensFreedom, Problem};
+use crate::bundle::{BundlePlan, LensFreedom, Motion, Problem};
 use crate::refine_model::noise_scale;
 use crate::scene::Scene;
 use crate::{CameraKnowledge, SfmModel, SfmView, Tracks};
@@ -68,7 +68,14 @@ pub fn model_covariance(
         CameraKnowledge::Focal { .. } | CameraKnowledge::Unknown => true,
     });
     let lens = if is_estimated { LensFreedom::Distortion } else { LensFreedom::Fixed };
-    let plan = BundlePlan { free: None, lens, scale: noise_scale(&scene), max_iterations: 0, tolerance: 0.0 };
+    let plan = BundlePlan {
+        free: None,
+        motion: Motion::Full,
+        lens,
+        scale: noise_scale(&scene),
+        max_iterations: 0,
+        tolerance: 0.0,
+    };
     // Outliers are no observations any more, so the loss is the square: the weights of a robust loss would understate
     // the noise.
     let problem = Problem::new(&scene, &plan, &vec![true; views.len()], RobustLoss::Trivial)?;

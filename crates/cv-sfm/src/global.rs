@@ -2,7 +2,7 @@
 //! fusion of relative motions", ICCV 2013; Pan et al., "Global structure-from-motion revisited", ECCV 2024).
 
 use crate::SfmOptions;
-use crate::bundle::{BundlePlan, LensFreedom, adjust};
+use crate::bundle::{BundlePlan, LensFreedom, Motion, adjust};
 use crate::global_positions::{adjust_rays, centers_from_baselines};
 use crate::model_parts::{Consistency, keep_largest_consistent_component};
 use crate::pair_scales::{Distances, estimate_baselines};
@@ -65,14 +65,25 @@ pub(crate) fn estimate_poses(
     let scale = options.max_error;
     adjust(
         scene,
-        &BundlePlan { free: None, lens: LensFreedom::Fixed, scale, max_iterations: 8, tolerance: 1e-2 },
+        &BundlePlan {
+            free: None,
+            motion: Motion::Full,
+            lens: LensFreedom::Fixed,
+            scale,
+            max_iterations: 8,
+            tolerance: 1e-2,
+        },
         stage,
     )?;
     update_tracks(scene, limits(0.0), &all);
     // A guessed focal length bends the whole model, and takes more iterations.
     let (rounds, max_iterations, tolerance) = if refinable { (2, 25, 1e-4) } else { (1, 8, 1e-3) };
     for _ in 0..rounds {
-        adjust(scene, &BundlePlan { free: None, lens, scale: 1.0, max_iterations, tolerance }, stage)?;
+        adjust(
+            scene,
+            &BundlePlan { free: None, motion: Motion::Full, lens, scale: 1.0, max_iterations, tolerance },
+            stage,
+        )?;
         update_tracks(scene, limits(0.0), &all);
     }
     // Views with few inliers are left for registration by the points of the others.

@@ -2,7 +2,7 @@
 //! tourism", 2006; Schönberger & Frahm, "Structure-from-motion revisited", CVPR 2016).
 
 use crate::SfmOptions;
-use crate::bundle::{BundlePlan, LensFreedom, adjust};
+use crate::bundle::{BundlePlan, LensFreedom, Motion, adjust};
 use crate::initial_pair::InitialPair;
 use crate::model::ViewOutcome;
 use crate::registration::{Registration, next_best_views, register};
@@ -19,8 +19,14 @@ pub(crate) fn growing_limits(options: &SfmOptions) -> PointLimits {
 }
 
 /// Bundle adjustment while a model grows.
-pub(crate) const GROWING_BUNDLE: BundlePlan<'static> =
-    BundlePlan { free: None, lens: LensFreedom::Fixed, scale: 1.0, max_iterations: 6, tolerance: 1e-3 };
+pub(crate) const GROWING_BUNDLE: BundlePlan<'static> = BundlePlan {
+    free: None,
+    motion: Motion::Full,
+    lens: LensFreedom::Fixed,
+    scale: 1.0,
+    max_iterations: 6,
+    tolerance: 1e-3,
+};
 
 /// Returns the same with intrinsics, to convergence and with a loss that is nearly quadratic for inliers: poses and
 /// points adapt to wrong intrinsics at nearly the same cost, so that they converge slowly, and not at all once the

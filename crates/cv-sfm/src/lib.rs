@@ -68,6 +68,7 @@ mod refine_model;
 mod registration;
 mod repeated_structure;
 mod rotation_averaging;
+mod rotation_only;
 mod scene;
 mod tracks;
 mod translation_direction;

@@ -10,6 +10,7 @@ use crate::model_parts::{Consistency, RemovedView, covisible_pairs, keep_largest
 use crate::pair_scales::{Distances, measure_distances};
 use crate::refine_model::refine_model;
 use crate::repeated_structure::reject_repeated_structure;
+use crate::rotation_only::is_rotation_only;
 use crate::scene::Scene;
 use crate::triangulate_track::update_tracks;
 use crate::view_graph::{RefusedPair, ViewGraph};
@@ -174,7 +175,8 @@ pub enum SfmError {
 /// most visible points, evenly spread over the image. Points are triangulated from whole tracks. After each
 /// registration a local bundle adjustment follows, and a global one when the model has grown. Parts of a model that the
 /// matches across contradict, and, with [`SfmInput::feature_distance`], views that lack nearly all points in their field
-/// of view, are removed ([`ViewOutcome::Contradicted`]). Views that no model contains start another one. O(observations)
+/// of view, are removed ([`ViewOutcome::Contradicted`]). A model
+/// of cameras that are not calibrated is discarded where rotations about one center explain it. Views that no model contains start another one. O(observations)
 /// for each adjustment; a model of n views has O(log n) global ones.
 ///
 /// # Errors
@@ -244,6 +246,7 @@ pub fn reconstruct_views_from(
         is_registered: vec![false; input.views.len()],
         outcomes: is_paired.iter().map(initial_outcome).collect(),
         rejected_support: None,
+        has_rotation: false,
         stage,
     };
     let (mut models, mut solvers): (Vec<SfmModel>, Vec<Solver>) = Default::default();
@@ -271,8 +274,8 @@ pub fn reconstruct_views_from(
     }
     if models.is_empty() {
         return Err(match state.rejected_support {
-            Some((agree, of)) => SfmError::Inconsistent { agree, of },
-            None => SfmError::NoInitialPair { pairs: input.pairs.len() },
+            Some((agree, of)) if !state.has_rotation => SfmError::Inconsistent { agree, of },
+            _ => SfmError::NoInitialPair { pairs: input.pairs.len() },
         });
     }
     Ok(SfmOutcome { models, solvers, views: state.outcomes, refused })
@@ -305,6 +308,8 @@ struct Reconstruction<'a, 'p> {
     outcomes: Vec<ViewOutcome>,
     /// Support of the last model that was rejected for too little of it: inliers and observations.
     rejected_support: Option<(usize, usize)>,
+    /// Whether a model was rejected because rotations explain it.
+    has_rotation: bool,
     stage: Stage<'p>,
 }
 
@@ -335,7 +340,13 @@ impl Reconstruction<'_, '_> {
             for pair in initial.iter().take(MAX_INITIAL_PAIRS) {
                 self.scene.clear(cameras, &self.tracks);
                 initialize(&mut self.scene, pair, self.options, &self.stage)?;
-                let Some(candidate) = self.complete_model(Solver::Incremental)? else { continue };
+                let Some(candidate) = self.complete_model(Solver::Incremental)? else {
+                    // Other lenses only imitate parallax, too.
+                    if self.has_rotation && 2 * self.scene.registered().len() >= remaining_views {
+                        return Ok(best);
+                    }
+                    continue;
+                };
                 let registered = candidate.model.registered();
                 let is_complete = registered as f64 >= COMPLETE_MODEL * remaining_views as f64;
                 let is_certain = is_complete && candidate.agree as f64 >= GOOD_SUPPORT * candidate.of as f64;
@@ -386,7 +397,8 @@ impl Reconstruction<'_, '_> {
         }
     }
 
-    /// Registers all views that the scene can take up and refines it; `None` where too few observations agree with it.
+    /// Registers all views that the scene can take up and refines it; `None` where too few observations agree with it, or
+    /// rotations explain them.
     fn complete_model(&mut self, solver: Solver) -> Result<Option<Candidate>, Cancelled> {
         let mut outcomes = self.outcomes.clone();
         let pairs: Vec<(usize, usize)> = self.pairs.iter().map(|p| (p.a, p.b)).collect();
@@ -410,6 +422,12 @@ impl Reconstruction<'_, '_> {
         let (agree, of) = self.scene.support();
         if (agree as f64) < MIN_SUPPORT * of as f64 {
             self.rejected_support = Some((agree, of));
+            return Ok(None);
+        }
+        if !self.scene.knowledge.iter().all(CameraKnowledge::is_calibrated)
+            && is_rotation_only(&mut self.scene, self.options, &self.stage)?
+        {
+            self.has_rotation = true;
             return Ok(None);
         }
         let model = SfmModel::from_scene(&self.scene, self.options.min_point_views);

@@ -1,6 +1,6 @@
 //! Final refinement of a model with approximate poses: bundle adjustment, track completion and filtering in turn.
 
-use crate::bundle::{BundlePlan, LensFreedom, adjust};
+use crate::bundle::{BundlePlan, LensFreedom, Motion, adjust};
 use crate::complete::{FeatureDistance, complete_tracks};
 use crate::scene::Scene;
 use crate::triangulate_track::{PointLimits, update_tracks};
@@ -101,7 +101,8 @@ fn adjust_and_filter(
     update_tracks(scene, limits, &all);
     for _ in 0..rounds {
         let before = scene.counts();
-        let plan = BundlePlan { free: None, lens, scale: noise_scale(scene), max_iterations, tolerance };
+        let plan =
+            BundlePlan { free: None, motion: Motion::Full, lens, scale: noise_scale(scene), max_iterations, tolerance };
         adjust(scene, &plan, progress)?;
         update_tracks(scene, limits, &all);
         if scene.counts().1.abs_diff(before.1) * 1000 < before.1 {
