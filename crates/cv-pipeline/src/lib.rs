@@ -98,7 +98,7 @@ pub use segment::{DetectResult, SegmentResult, SegmentTraining, detect, segment,
 pub use sfm::{
     DensePhoto, GpsCenters, GpsFix, OtherSize, PhotoOrder, PhotoProgress, PlacedModel, SfmCamera, SfmCameras, SfmDense,
     SfmDenseError, SfmDenseOptions, SfmJobError, SfmJobOptions, SfmPhoto, SfmPhotoError, SfmResult, gps_centers,
-    place_model, sfm, sfm_covariance, sfm_dense, sfm_pairs, sfm_photo, sfm_solve,
+    place_model, sfm, sfm_covariance, sfm_dense, sfm_focal_deviations, sfm_pairs, sfm_photo, sfm_solve,
 };
 
 /// Types of the stereo stage: options and results, rectification, geometry and scores.

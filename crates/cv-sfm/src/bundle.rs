@@ -307,7 +307,7 @@ pub(crate) struct Problem<'a> {
     pub(crate) adjustment: Adjustment<'a>,
     pub(crate) poses: GroupId,
     pub(crate) points: GroupId,
-    lenses: Option<GroupId>,
+    pub(crate) lenses: Option<GroupId>,
     /// View of each pose block.
     pub(crate) views: Vec<usize>,
     /// Track of each point block.

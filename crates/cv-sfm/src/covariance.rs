@@ -46,6 +46,59 @@ pub fn model_covariance(
     knowledge: &[CameraKnowledge],
     model: &SfmModel,
 ) -> Result<ModelCovariance, AdjustError> {
+    let (scene, problem) = problem_of(views, knowledge, model, LensFreedom::Distortion)?;
+    let variance = problem.adjustment.variance()?;
+    let covariance = problem.adjustment.covariance(variance)?;
+    let mut poses = vec![None; views.len()];
+    for (view, of) in problem.views.iter().zip(covariance.of_group(problem.poses)) {
+        poses[*view] = scene.poses[*view].map(|pose| of.map(|of| pose_covariance(&pose, &of))).transpose()?;
+    }
+    let mut points = vec![None; model.points.len()];
+    for (point, of) in problem.tracks.iter().zip(covariance.of_group(problem.points)) {
+        points[*point] = of.ok().map(|of| of.fixed_view::<3, 3>(0, 0).into_owned());
+    }
+    let reference = problem.reference.ok_or_else(|| AdjustError::Index {
+        name: "poses".to_owned(),
+        index: 1,
+        len: problem.views.len(),
+    })?;
+    Ok(ModelCovariance { reference, noise: variance.sqrt(), poses, points })
+}
+
+/// Computes the standard deviation in pixels of each focal length that was estimated, by the matches and the weak prior of
+/// the adjustment: `None` for a calibrated camera, and for one that no view of the model has. The principal point counts
+/// as estimated. It is a tenth of the focal length or more where the views do not determine it, as with cameras that only
+/// translate. Arguments and complexity are those of [`model_covariance`].
+///
+/// # Errors
+/// As [`model_covariance`].
+pub fn focal_deviations(
+    views: &[SfmView<'_>],
+    knowledge: &[CameraKnowledge],
+    model: &SfmModel,
+) -> Result<Vec<Option<f64>>, AdjustError> {
+    let (scene, problem) = problem_of(views, knowledge, model, LensFreedom::PrincipalPoint)?;
+    let Some(lenses) = problem.lenses else { return Ok(vec![None; model.cameras.len()]) };
+    let covariance = problem.adjustment.covariance(problem.adjustment.variance()?)?;
+    let mut is_estimated = vec![false; model.cameras.len()];
+    for view in scene.registered() {
+        let camera = views[view].camera;
+        is_estimated[camera] = !knowledge[camera].is_calibrated();
+    }
+    let deviation = |c: usize| match is_estimated[c] {
+        true => Ok(Some(covariance.of(lenses, c)?[(0, 0)].max(0.0).sqrt())),
+        false => Ok(None),
+    };
+    (0..model.cameras.len()).map(deviation).collect()
+}
+
+/// Returns a model as a scene and its least squares problem; `freedom` is that of intrinsics that were estimated.
+fn problem_of<'a>(
+    views: &'a [SfmView<'a>],
+    knowledge: &'a [CameraKnowledge],
+    model: &SfmModel,
+    freedom: LensFreedom,
+) -> Result<(Scene<'a>, Problem<'static>), AdjustError> {
     let is_mismatched = model.poses.len() != views.len()
         || views.iter().any(|v| v.camera >= model.cameras.len().min(knowledge.len()))
         || model
@@ -67,7 +120,7 @@ pub fn model_covariance(
         CameraKnowledge::Matrix => camera.distortion.parameters().iter().any(|k| *k != 0.0),
         CameraKnowledge::Focal { .. } | CameraKnowledge::Unknown => true,
     });
-    let lens = if is_estimated { LensFreedom::Distortion } else { LensFreedom::Fixed };
+    let lens = if is_estimated { freedom } else { LensFreedom::Fixed };
     let plan = BundlePlan {
         free: None,
         motion: Motion::Full,
@@ -79,22 +132,7 @@ pub fn model_covariance(
     // Outliers are no observations any more, so the loss is the square: the weights of a robust loss would understate
     // the noise.
     let problem = Problem::new(&scene, &plan, &vec![true; views.len()], RobustLoss::Trivial)?;
-    let variance = problem.adjustment.variance()?;
-    let covariance = problem.adjustment.covariance(variance)?;
-    let mut poses = vec![None; views.len()];
-    for (view, of) in problem.views.iter().zip(covariance.of_group(problem.poses)) {
-        poses[*view] = scene.poses[*view].map(|pose| of.map(|of| pose_covariance(&pose, &of))).transpose()?;
-    }
-    let mut points = vec![None; model.points.len()];
-    for (point, of) in problem.tracks.iter().zip(covariance.of_group(problem.points)) {
-        points[*point] = of.ok().map(|of| of.fixed_view::<3, 3>(0, 0).into_owned());
-    }
-    let reference = problem.reference.ok_or_else(|| AdjustError::Index {
-        name: "poses".to_owned(),
-        index: 1,
-        len: problem.views.len(),
-    })?;
-    Ok(ModelCovariance { reference, noise: variance.sqrt(), poses, points })
+    Ok((scene, problem))
 }
 
 /// Converts the covariance of a rotation ω and a translation τ, `R ← exp(ω) R` and `t ← t + τ`: the center `−Rᵀ t`

@@ -79,7 +79,7 @@ mod view_pair;
 
 pub use align::{CenterFit, KnownPlaces, ModelAlignError, ModelAlignment, align_model, align_to_poses};
 pub use complete::FeatureDistance;
-pub use covariance::{ModelCovariance, PoseCovariance, model_covariance};
+pub use covariance::{ModelCovariance, PoseCovariance, focal_deviations, model_covariance};
 pub use cv_numeric::adjust::AdjustError;
 pub use model::{SfmModel, SfmPoint, ViewOutcome};
 pub use reconstruct::{SfmError, SfmInput, SfmOptions, SfmOutcome, Solver, reconstruct_views, reconstruct_views_from};

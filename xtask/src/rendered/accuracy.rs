@@ -116,13 +116,13 @@ fn check_walk(walk: &Walk, side: f64) -> Result<Vec<Check>> {
 }
 
 /// Largest errors over the images of a model: of the camera center in meters, of the rotation in degrees.
-struct PoseErrors {
-    center: f64,
-    rotation: f64,
+pub(super) struct PoseErrors {
+    pub(super) center: f64,
+    pub(super) rotation: f64,
 }
 
 impl PoseErrors {
-    fn of(model: &SfmModel, truth: &[Pose]) -> Result<Self> {
+    pub(super) fn of(model: &SfmModel, truth: &[Pose]) -> Result<Self> {
         let both: Vec<(&Pose, &Pose)> =
             model.poses.iter().zip(truth).filter_map(|(found, truth)| Some((found.as_ref()?, truth))).collect();
         let (found, true_centers): (Vec<Point3<f64>>, Vec<Point3<f64>>) =

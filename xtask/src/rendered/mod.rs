@@ -5,6 +5,7 @@
 //! two renderings at a small size, so that a change of the renderer invalidates the cache.
 
 mod accuracy;
+mod self_calibration;
 
 use crate::checks::{self, Check};
 use anyhow::Result;
@@ -22,6 +23,7 @@ const JOBS: &[checks::Named<Job>] = &[
     ("street-12", accuracy::street_12),
     ("street-50", accuracy::street_50),
     ("street-gaps", accuracy::street_gaps),
+    ("self-calibration", self_calibration::self_calibration),
     ("street-200", accuracy::street_200),
 ];
 

@@ -22,8 +22,8 @@ use cv_io::ply::PlyEncoding;
 use cv_pipeline::features::FeatureError;
 use cv_pipeline::many_views::{SfmModel, Solver};
 use cv_pipeline::{
-    PhotoOrder, PhotoProgress, Progress, SfmJobOptions, SfmPhoto, SfmPhotoError, sfm_covariance, sfm_pairs, sfm_photo,
-    sfm_solve,
+    PhotoOrder, PhotoProgress, Progress, SfmJobOptions, SfmPhoto, SfmPhotoError, sfm_covariance, sfm_focal_deviations,
+    sfm_pairs, sfm_photo, sfm_solve,
 };
 use dense::DenseArgs;
 use earlier::Earlier;
@@ -32,6 +32,9 @@ use photographs::{Photograph, photographs, relative_path};
 use pinhole::PinholeFolder;
 use places::{Frame, PlaceArgs, Places};
 use std::path::{Path, PathBuf};
+
+/// Maximum number of views of a model whose focal length is checked: the normal equations are dense, O(views³).
+const MAX_VIEWS_OF_DEVIATIONS: usize = 200;
 
 /// Reconstruct camera poses and a sparse point cloud from many photographs (structure from motion).
 ///
@@ -240,6 +243,15 @@ impl Args {
         stages.extend(clock.into_stages());
         if let Some(text) = completeness_warning(&models, &registered) {
             context.warn(text);
+        }
+        if let Some(model) = result.models.first().filter(|m| m.registered() <= MAX_VIEWS_OF_DEVIATIONS) {
+            let deviations = sfm_focal_deviations(&photos, cameras.list(), model).unwrap_or_default();
+            deviations
+                .iter()
+                .zip(&model.cameras)
+                .filter_map(|(deviation, camera)| words::many_views::focal_uncertain(camera.fx, (*deviation)?))
+                .take(1)
+                .for_each(|text| context.warn(text));
         }
         context.report(|| report::report(&all, &registered, &models, &frames, &stages))?;
         let done = outcome(&all, &registered, &models, &frames, &result, checkpoint.reused(), stages);

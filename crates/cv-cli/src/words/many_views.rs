@@ -26,6 +26,21 @@ pub(crate) fn left_out(outcome: &ViewOutcome) -> Option<String> {
     }
 }
 
+/// Words that the photographs do not determine a focal length, if its relative standard deviation is above
+/// [`MAX_FOCAL_DEVIATION`].
+pub(crate) fn focal_uncertain(focal: f64, deviation: f64) -> Option<String> {
+    (deviation > MAX_FOCAL_DEVIATION * focal).then(|| {
+        format!(
+            "the photographs do not determine the focal length, {focal:.0} px in the model: the camera hardly turned between them, and depths may be stretched; try: --camera FILE or --focal PIXELS, or photographs of the same place in other directions"
+        )
+    })
+}
+
+/// Largest relative standard deviation of a focal length without a warning. Where views determine it, it is 0.3 % or less,
+/// and 4 % around an object from a constant height (where it is exchanged for the principal point); with cameras that only
+/// translate, 15 % and more.
+const MAX_FOCAL_DEVIATION: f64 = 0.1;
+
 /// Numbers of refused pairs of photographs, by reason.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(crate) struct RefusedPairs {

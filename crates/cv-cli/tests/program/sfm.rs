@@ -171,13 +171,25 @@ fn a_walk_around_a_room_is_reconstructed_and_written_completely() {
 fn an_unknown_focal_length_is_estimated() {
     let folder = tempfile::tempdir().unwrap();
     let truth = photographs(&folder.path().join("photos"), "walk", &Scene::room(4), &Scene::room_walk(12));
-    let value = json(folder.path(), &["sfm", "photos", "-o", "model", "--quiet"]);
+    let ran = run(folder.path(), &["sfm", "photos", "-o", "model", "--json"]);
+    let value: Value = serde_json::from_str(&ran.stdout).unwrap();
     assert_eq!(used(&value), [true; 12], "{value}");
     let focal = value["focal_px"][0].as_f64().unwrap();
     let [turn, direction, off] = worst(&colmap::read(folder.path().join("model")).unwrap(), &truth);
     // The walk is closed: a focal length error of 1 % would leave a gap of the 360°. Radial distortion, estimated with it, compensates some of it.
     assert!((focal / FOCAL - 1.0).abs() < 0.01, "{focal}");
     assert!(turn < 0.5 && direction < 1.0 && off < 0.01, "{turn} {direction} {off}");
+    assert!(!ran.stderr.contains("do not determine the focal length"), "{ran:?}");
+
+    // Without a rotation, focal length and depth are interchangeable.
+    let pose = |i: usize| Pose::new(cv_core::Rotation3::identity(), Vector3::new(-0.3 * i as f64, 1.3, 0.0));
+    let poses: Vec<Pose> = (0..5).map(pose).collect();
+    photographs(&folder.path().join("aside"), "aside", &Scene::room(4), &poses);
+    let ran = run(folder.path(), &["sfm", "aside", "-o", "aside-model"]);
+    assert!(ran.code == Some(0) && ran.stderr.contains("do not determine the focal length"), "{ran:?}");
+    // With it, nothing is said.
+    let ran = run(folder.path(), &["sfm", "aside", "--camera", "K.txt", "--undistorted", "-o", "aside-known"]);
+    assert!(ran.code == Some(0) && !ran.stderr.contains("focal length"), "{ran:?}");
 }
 
 #[test]

@@ -21,8 +21,8 @@ use cv_features::{FeatureOptions, RatioTest, SiftOptions};
 use cv_geometry::EXIF_FOCAL_DEVIATION;
 use cv_sfm::{
     AdjustError, CameraKnowledge, FeatureDistance, ModelCovariance, Observation, PairMatches, RefusedPair, SfmError,
-    SfmInput, SfmModel, SfmView, Solver, ViewOutcome, ViewPairModel, ViewPairOptions, model_covariance,
-    reconstruct_views_from,
+    SfmInput, SfmModel, SfmView, Solver, ViewOutcome, ViewPairModel, ViewPairOptions, focal_deviations,
+    model_covariance, reconstruct_views_from,
 };
 
 /// Settings of [`sfm`].
@@ -263,6 +263,20 @@ pub fn sfm_covariance(
     check_cameras(photos, cameras)?;
     let knowledge: Vec<CameraKnowledge> = cameras.iter().map(|c| c.knowledge).collect();
     model_covariance(&views(photos), &knowledge, model).map_err(SfmJobError::Covariance)
+}
+
+/// Computes the standard deviations in pixels of the focal lengths of a model of [`sfm`] that were estimated, by camera ([`focal_deviations`]).
+///
+/// # Errors
+/// [`SfmJobError::Covariance`].
+pub fn sfm_focal_deviations(
+    photos: &[SfmPhoto],
+    cameras: &[SfmCamera],
+    model: &SfmModel,
+) -> Result<Vec<Option<f64>>, SfmJobError> {
+    check_cameras(photos, cameras)?;
+    let knowledge: Vec<CameraKnowledge> = cameras.iter().map(|c| c.knowledge).collect();
+    focal_deviations(&views(photos), &knowledge, model).map_err(SfmJobError::Covariance)
 }
 
 fn views(photos: &[SfmPhoto]) -> Vec<SfmView<'_>> {

@@ -6,7 +6,7 @@ use cv_core::{Camera, DMatch, Keypoint, Point3, Pose, Silent};
 use cv_geometry::align_points;
 use cv_sfm::{
     CameraKnowledge, FeatureDistance, Observation, PairMatches, SfmError, SfmInput, SfmOptions, SfmOutcome, SfmView,
-    Solver, ViewOutcome, ViewPairModel, ViewPairOptions, reconstruct_views, verify_view_pair,
+    Solver, ViewOutcome, ViewPairModel, ViewPairOptions, focal_deviations, reconstruct_views, verify_view_pair,
 };
 use cv_synth::{FeatureViews, FeatureViewsOptions};
 
@@ -82,6 +82,10 @@ impl Dataset {
         }
     }
 
+    fn views(&self) -> Vec<SfmView<'_>> {
+        self.keypoints.iter().map(|k| SfmView { camera: 0, keypoints: k }).collect()
+    }
+
     fn solve(&self) -> Result<SfmOutcome, SfmError> {
         self.solve_with(None)
     }
@@ -95,7 +99,7 @@ impl Dataset {
         solver: Solver,
         feature_distance: Option<&dyn FeatureDistance>,
     ) -> Result<SfmOutcome, SfmError> {
-        let views: Vec<SfmView<'_>> = self.keypoints.iter().map(|k| SfmView { camera: 0, keypoints: k }).collect();
+        let views = self.views();
         let input = SfmInput {
             views: &views,
             cameras: &self.cameras,
@@ -291,11 +295,40 @@ fn an_unknown_focal_length_is_estimated_around_an_object() {
     let found = dataset.solve().unwrap();
     assert_eq!(found.models[0].registered(), 12, "{:?}", found.views);
     let focal = found.models[0].cameras[0].fx;
+    let deviation = focal_deviations(&dataset.views(), &dataset.knowledge, &found.models[0]).unwrap()[0].unwrap();
     // The keypoint noise leaves a thousandth of the focal length. (And some pixels of the principal point, or tenths of
     // a degree of a pitch common to all views, which the positions do not show.)
-    assert!((focal / camera.fx - 1.0).abs() < 5e-3, "{focal} of {}", camera.fx);
+    assert!((focal - camera.fx).abs() < 4.0 * deviation, "{focal} ± {deviation}");
+    assert!(deviation < 0.05 * camera.fx && (focal / camera.fx - 1.0).abs() < 5e-3, "{focal} ± {deviation}");
     let (center, _) = errors(&found.models[0].poses, &poses);
     assert!(center < MAX_CENTER_ERROR, "{center}");
+}
+
+#[test]
+fn a_focal_length_that_translations_do_not_determine_has_a_large_deviation() {
+    let truth = walk(12);
+    let camera = truth.camera;
+    let rotation = truth.poses[0].rotation;
+    let pose = |i: usize| {
+        let aside = cv_core::Vector3::new(0.4 * i as f64, 0.0, 0.0);
+        Pose::new(rotation, truth.poses[0].translation - aside)
+    };
+    let poses: Vec<Pose> = (0..6).map(pose).collect();
+    let wrong = 1.04 * camera.fx;
+    let start = Camera {
+        distortion: cv_core::Distortion::radial(0.0, 0.0),
+        ..Camera::from_focal(camera.width, camera.height, wrong)
+    };
+    for knowledge in [CameraKnowledge::Unknown, CameraKnowledge::Focal { focal: wrong, deviation: 0.05 }] {
+        let dataset = Dataset::of_points(&truth.points, &poses, &camera, (knowledge, start));
+        let found = dataset.solve().unwrap();
+        assert_eq!(found.models[0].registered(), 6, "{:?}", found.views);
+        let deviation = focal_deviations(&dataset.views(), &dataset.knowledge, &found.models[0]).unwrap()[0].unwrap();
+        assert!(deviation > 0.1 * found.models[0].cameras[0].fx, "{deviation}");
+    }
+    let dataset = Dataset::of_points(&truth.points, &poses, &camera, (CameraKnowledge::Known, camera));
+    let found = dataset.solve().unwrap();
+    assert_eq!(focal_deviations(&dataset.views(), &dataset.knowledge, &found.models[0]), Ok(vec![None]));
 }
 
 #[test]
