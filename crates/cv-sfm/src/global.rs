@@ -53,7 +53,7 @@ pub(crate) fn estimate_poses(
     let max_focal = scene.cameras.iter().map(|c| c.fx).fold(0.0, f64::max);
     let all: Vec<usize> = (0..scene.tracks.len()).collect();
     let limits = |angle: f64| {
-        let error = (angle * max_focal).max(options.growing_error());
+        let error = (angle * max_focal).max(options.initial_error());
         PointLimits { error, angle: options.min_angle }
     };
     update_tracks(scene, limits(RAY_THRESHOLDS[0]), &all);

@@ -14,8 +14,8 @@ use cv_core::{Cancelled, Pose, Stage};
 const LOCAL_BUNDLE_VIEWS: usize = 6;
 
 /// Returns the limits while a model grows, when poses and intrinsics are not final.
-pub(crate) fn growing_limits(options: &SfmOptions) -> PointLimits {
-    PointLimits { error: options.growing_error(), angle: options.min_angle }
+pub(crate) fn growing_limits(scene: &Scene<'_>, options: &SfmOptions) -> PointLimits {
+    PointLimits { error: options.growing_error(scene.knowledge), angle: options.min_angle }
 }
 
 /// Bundle adjustment while a model grows.
@@ -31,11 +31,11 @@ pub(crate) const GROWING_BUNDLE: BundlePlan<'static> = BundlePlan {
 /// Returns the same with intrinsics, to convergence and with a loss that is nearly quadratic for inliers: poses and
 /// points adapt to wrong intrinsics at nearly the same cost, so that they converge slowly, and not at all once the
 /// observations that contradict them are outliers.
-fn growing_bundle_with_intrinsics(options: &SfmOptions) -> BundlePlan<'static> {
+fn growing_bundle_with_intrinsics(scene: &Scene<'_>, options: &SfmOptions) -> BundlePlan<'static> {
     BundlePlan {
         lens: LensFreedom::Distortion,
-        scale: options.growing_error(),
-        max_iterations: 50,
+        scale: options.growing_error(scene.knowledge),
+        max_iterations: 200,
         tolerance: 1e-6,
         ..GROWING_BUNDLE
     }
@@ -54,9 +54,10 @@ pub(crate) fn initialize(
     scene.poses[pair.a] = Some(Pose::identity());
     scene.poses[pair.b] = Some(pair.pose);
     let tracks: Vec<usize> = scene.view_observations(pair.a).map(|i| scene.track_of(i)).collect();
-    update_tracks(scene, growing_limits(options), &tracks);
+    let limits = growing_limits(scene, options);
+    update_tracks(scene, limits, &tracks);
     adjust(scene, &GROWING_BUNDLE, stage)?;
-    update_tracks(scene, growing_limits(options), &tracks);
+    update_tracks(scene, limits, &tracks);
     Ok(())
 }
 
@@ -72,6 +73,7 @@ pub(crate) fn extend(
     stage: &Stage<'_>,
 ) -> Result<(), Cancelled> {
     let all: Vec<usize> = (0..scene.tracks.len()).collect();
+    let limits = growing_limits(scene, options);
     let mut adjusted = scene.registered().len();
     // For a refused view, the number of visible points at the time: it is tried again with a tenth more.
     let mut refused = vec![0usize; scene.views.len()];
@@ -101,19 +103,19 @@ pub(crate) fn extend(
         let Some((view, pose)) = next else { break };
         scene.poses[view] = Some(pose);
         let tracks: Vec<usize> = scene.view_observations(view).map(|i| scene.track_of(i)).collect();
-        update_tracks(scene, growing_limits(options), &tracks);
+        update_tracks(scene, limits, &tracks);
         let local_views = local_bundle_views(scene, view);
         let local = BundlePlan { free: Some(&local_views), max_iterations: 3, ..GROWING_BUNDLE };
         let registered = scene.registered().len();
         if registered as f64 >= adjusted as f64 * options.growth || registered < 6 {
             let refinable = registered > 2 && scene.knowledge.iter().any(|k| !k.is_calibrated());
-            let plan = if refinable { growing_bundle_with_intrinsics(options) } else { GROWING_BUNDLE };
+            let plan = if refinable { growing_bundle_with_intrinsics(scene, options) } else { GROWING_BUNDLE };
             adjust(scene, &plan, stage)?;
-            update_tracks(scene, growing_limits(options), &all);
+            update_tracks(scene, limits, &all);
             adjusted = registered;
         } else {
             adjust(scene, &local, stage)?;
-            update_tracks(scene, growing_limits(options), &tracks);
+            update_tracks(scene, limits, &tracks);
         }
         stage.add(1)?;
     }

@@ -22,7 +22,7 @@ pub(crate) fn register_known_poses(
         *pose = *known;
     }
     let all: Vec<usize> = (0..scene.tracks.len()).collect();
-    let limits = growing_limits(options);
+    let limits = growing_limits(scene, options);
     loop {
         stage.check()?;
         update_tracks(scene, limits, &all);

@@ -7,10 +7,8 @@ use cv_core::{Cancelled, Point3, Pose, Progress, Vector3};
 
 /// Maximum number of points that are tested.
 const MAX_POINTS: usize = 2000;
-/// Minimum ratio of the inliers that are inliers of the rotations, too.
-const MIN_EXPLAINED: f64 = 0.98;
 
-/// Returns whether rotations about one center explain nearly all inliers of a model, with some focal length and
+/// Returns whether rotations about one center explain at least the ratio `min_explained` of the inliers of a model, with some focal length and
 /// distortion of the cameras that are not calibrated. The points of a model have parallaxes far above
 /// [`SfmOptions::max_error`], which rotations do not explain. The scene is not changed. O(views³), for at most 2,000
 /// points.
@@ -19,6 +17,7 @@ const MIN_EXPLAINED: f64 = 0.98;
 /// [`Cancelled`]; the scene is then without its solution.
 pub(crate) fn is_rotation_only(
     scene: &mut Scene<'_>,
+    min_explained: f64,
     options: &SfmOptions,
     progress: &dyn Progress,
 ) -> Result<bool, Cancelled> {
@@ -42,7 +41,7 @@ pub(crate) fn is_rotation_only(
         free: None,
         motion: Motion::Rotation,
         lens: LensFreedom::Distortion,
-        scale: options.growing_error(),
+        scale: options.growing_error(scene.knowledge),
         max_iterations: 50,
         tolerance: 1e-6,
     };
@@ -56,5 +55,5 @@ pub(crate) fn is_rotation_only(
         }
     }
     scene.restore(solution);
-    Ok(explained as f64 >= MIN_EXPLAINED * all as f64)
+    Ok(explained as f64 >= min_explained * all as f64)
 }

@@ -189,7 +189,7 @@ impl ViewGraph {
         let repaired = |(link, _): &(Link, usize)| {
             let rotation = rotations[link.b]? * rotations[link.a]?.inverse();
             let (rays, unit) = normalized_matches(input, cameras, link.pair);
-            let threshold = options.growing_error() * unit;
+            let threshold = options.initial_error() * unit;
             let (pose, inlier_ratio) = pose_given_rotation(&rotation, &rays, threshold)?;
             let has_enough =
                 inlier_ratio >= MIN_INLIER_RATIO && inlier_ratio * rays.len() as f64 >= options.min_pose_inliers as f64;
@@ -285,7 +285,7 @@ fn relative_pose(
         return Ok(Some(pose));
     }
     let (rays, unit) = normalized_matches(input, cameras, pair);
-    let threshold = options.growing_error() * unit;
+    let threshold = options.initial_error() * unit;
     let step = rays.len().div_ceil(MAX_RANSAC_MATCHES).max(1);
     let sampled: Vec<Correspondence> = rays.iter().step_by(step).copied().collect();
     let robust = RobustOptions { threshold, seed: options.seed, max_iterations: 1000, ..RobustOptions::essential() };
