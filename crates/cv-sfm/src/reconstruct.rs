@@ -181,9 +181,10 @@ pub enum SfmError {
 /// most visible points, evenly spread over the image. Points are triangulated from whole tracks. After each
 /// registration a local bundle adjustment follows, and a global one when the model has grown. Parts of a model that the
 /// matches across contradict, and, with [`SfmInput::feature_distance`], views that lack nearly all points in their field
-/// of view, are removed ([`ViewOutcome::Contradicted`]). A model
-/// of cameras that are not calibrated is discarded where rotations about one center explain it. Views that no model contains start another one. O(observations)
-/// for each adjustment; a model of n views has O(log n) global ones.
+/// of view, are removed ([`ViewOutcome::Contradicted`]). Where cameras are not calibrated, several initial focal lengths
+/// are tried until nearly all views and keypoints agree with a model, and models that rotations about one center explain
+/// are discarded. Views that no model contains start another one. O(observations) for each adjustment; a model of n views
+/// has O(log n) global ones.
 ///
 /// # Errors
 /// [`SfmError`].
@@ -315,8 +316,9 @@ struct Reconstruction<'a, 'p> {
     outcomes: Vec<ViewOutcome>,
     /// Support of the last model that was rejected for too little of it: inliers and observations.
     rejected_support: Option<(usize, usize)>,
-    /// Whether rotations explain a rejected model, and the number of views of the largest one that had enough support.
+    /// Whether rotations explain a rejected model.
     has_rotation: bool,
+    /// Number of views of the largest candidate of the present model that had enough support, but that rotations explain.
     rotating_views: usize,
     stage: Stage<'p>,
 }
@@ -331,6 +333,7 @@ impl Reconstruction<'_, '_> {
         remaining.iter().for_each(|p| (remaining_views[p.a], remaining_views[p.b]) = (true, true));
         let remaining_views = remaining_views.into_iter().filter(|o| *o).count();
         let mut best: Option<Candidate> = None;
+        self.rotating_views = 0;
         for (n, cameras) in cameras.iter().enumerate() {
             if n == 0
                 && let Some(candidate) = self.solve_globally(cameras)?
@@ -473,9 +476,10 @@ const MIN_SUPPORT: f64 = 0.3;
 const MIN_INLIERS_OF_ROTATION: f64 = 0.98;
 /// The same of all matched keypoints, with their outliers.
 const MIN_MATCHES_OF_ROTATION: f64 = 0.9;
-/// Ratio of inliers from which on no other focal lengths are tried, and minimum ratio of registered views: with a focal
-/// length that is far off, a model may have all views and 40 to 60 % agree, or half of the views and 90 % agree.
+/// Minimum ratio of inliers among the matched keypoints of a model with which no other focal length is tried: with one that
+/// is far off, a model may have all views and 40 to 60 % agree.
 const GOOD_SUPPORT: f64 = 0.75;
+/// The same of registered views: with a wrong lens, a model may have half of the views and 90 % agree.
 const COMPLETE_MODEL: f64 = 0.9;
 /// Maximum number of times that a model is extended: its parts may turn out to be inconsistent where they meet, and only
 /// the largest is kept then.

@@ -8,10 +8,10 @@ use cv_core::{Cancelled, Point3, Pose, Progress, Vector3};
 /// Maximum number of points that are tested.
 const MAX_POINTS: usize = 2000;
 
-/// Returns whether rotations about one center explain at least the ratio `min_explained` of the inliers of a model, with some focal length and
-/// distortion of the cameras that are not calibrated. The points of a model have parallaxes far above
-/// [`SfmOptions::max_error`], which rotations do not explain. The scene is not changed. O(views³), for at most 2,000
-/// points.
+/// Returns whether rotations about one center explain at least the ratio `min_explained` of the inliers of a model, with
+/// some focal length and distortion of the cameras that are not calibrated. The points of a model have parallaxes far
+/// above [`SfmOptions::max_error`], which rotations do not explain. The scene is not changed. O(views³), for at most
+/// 2,000 points.
 ///
 /// # Errors
 /// [`Cancelled`]; the scene is then without its solution.
@@ -55,5 +55,5 @@ pub(crate) fn is_rotation_only(
         }
     }
     scene.restore(solution);
-    Ok(explained as f64 >= min_explained * all as f64)
+    Ok(all > 0 && explained as f64 >= min_explained * all as f64)
 }
