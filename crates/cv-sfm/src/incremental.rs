@@ -15,7 +15,7 @@ const LOCAL_BUNDLE_VIEWS: usize = 6;
 
 /// Returns the limits while a model grows, when poses and intrinsics are not final.
 pub(crate) fn growing_limits(scene: &Scene<'_>, options: &SfmOptions) -> PointLimits {
-    PointLimits { error: options.growing_error(scene.knowledge), angle: options.min_angle }
+    PointLimits { error: options.growing_error(scene), angle: options.min_angle }
 }
 
 /// Bundle adjustment while a model grows.
@@ -34,7 +34,7 @@ pub(crate) const GROWING_BUNDLE: BundlePlan<'static> = BundlePlan {
 fn growing_bundle_with_intrinsics(scene: &Scene<'_>, options: &SfmOptions) -> BundlePlan<'static> {
     BundlePlan {
         lens: LensFreedom::Distortion,
-        scale: options.growing_error(scene.knowledge),
+        scale: options.growing_error(scene),
         max_iterations: 200,
         tolerance: 1e-6,
         ..GROWING_BUNDLE
@@ -108,7 +108,7 @@ pub(crate) fn extend(
         let local = BundlePlan { free: Some(&local_views), max_iterations: 3, ..GROWING_BUNDLE };
         let registered = scene.registered().len();
         if registered as f64 >= adjusted as f64 * options.growth || registered < 6 {
-            let refinable = registered > 2 && scene.knowledge.iter().any(|k| !k.is_calibrated());
+            let refinable = registered > 2 && !scene.is_calibrated();
             let plan = if refinable { growing_bundle_with_intrinsics(scene, options) } else { GROWING_BUNDLE };
             adjust(scene, &plan, stage)?;
             update_tracks(scene, limits, &all);

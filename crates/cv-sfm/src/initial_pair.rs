@@ -62,7 +62,7 @@ fn score_pair(
         pair.matches.iter().filter_map(|m| m.correspondence(keypoints[0], keypoints[1])).collect();
     let (rays, unit) = normalize_matches(&pixels, scene.camera_of(a), scene.camera_of(b));
     let rays: Vec<Correspondence> = rays.into_iter().filter(Correspondence::is_finite).collect();
-    let threshold = options.growing_error(scene.knowledge) * unit;
+    let threshold = options.growing_error(scene) * unit;
     let robust = RobustOptions {
         threshold,
         seed: options.seed,

@@ -38,7 +38,7 @@ pub(crate) fn refine_model(
     options: &SfmOptions,
     progress: &dyn Progress,
 ) -> Result<(), Cancelled> {
-    let is_uncalibrated = scene.knowledge.iter().any(|k| !k.is_calibrated());
+    let is_uncalibrated = !scene.is_calibrated();
     let lens = if is_uncalibrated { LensFreedom::Distortion } else { LensFreedom::Fixed };
     adjust_and_filter(scene, lens, COARSE, options, progress)?;
     if let Some(feature_distance) = feature_distance {

@@ -75,7 +75,7 @@ pub(crate) fn register(
         .filter_map(|i| Some(WorldMatch { world: scene.points[scene.track_of(i)]?, image: scene.ray(i) }))
         .filter(|m| m.image.x.is_finite())
         .collect();
-    let threshold = options.growing_error(scene.knowledge) / scene.camera_of(view).fx;
+    let threshold = options.growing_error(scene) / scene.camera_of(view).fx;
     let robust = RobustOptions { threshold, seed: options.seed, max_iterations: 5000, ..RobustOptions::essential() };
     let estimate = match estimate_pose(&matches, &robust, progress) {
         Ok(estimate) => estimate,

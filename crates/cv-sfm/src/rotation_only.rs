@@ -22,10 +22,11 @@ pub(crate) fn is_rotation_only(
     progress: &dyn Progress,
 ) -> Result<bool, Cancelled> {
     let solution = scene.solution();
-    let step = scene.counts().0.div_ceil(MAX_POINTS).max(1);
-    let with_points: Vec<usize> = (0..scene.points.len()).filter(|t| scene.points[*t].is_some()).collect();
+    let has_inliers = |t: &usize| scene.tracks.range(*t).any(|i| scene.active[i]);
+    let tracks: Vec<usize> = (0..scene.tracks.len()).filter(has_inliers).collect();
+    let step = tracks.len().div_ceil(MAX_POINTS).max(1);
     scene.points.fill(None);
-    for &track in with_points.iter().step_by(step) {
+    for track in tracks.into_iter().step_by(step) {
         let active = scene.tracks.range(track).filter(|i| scene.active[*i]);
         let direction = |i: usize| {
             let pose = scene.poses[scene.view_of(i)].as_ref()?;
@@ -41,7 +42,7 @@ pub(crate) fn is_rotation_only(
         free: None,
         motion: Motion::Rotation,
         lens: LensFreedom::Distortion,
-        scale: options.growing_error(scene.knowledge),
+        scale: options.growing_error(scene),
         max_iterations: 50,
         tolerance: 1e-6,
     };

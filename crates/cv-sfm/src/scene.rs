@@ -81,6 +81,11 @@ impl<'a> Scene<'a> {
         self.rays = (0..self.active.len()).into_par_iter().map(ray).collect();
     }
 
+    /// Returns whether the intrinsics of all cameras are known.
+    pub(crate) fn is_calibrated(&self) -> bool {
+        self.knowledge.iter().all(CameraKnowledge::is_calibrated)
+    }
+
     pub(crate) fn camera_of(&self, view: usize) -> &Camera {
         &self.cameras[self.views[view].camera]
     }
@@ -163,14 +168,12 @@ impl<'a> Scene<'a> {
         (0..self.tracks.len()).map(count).fold((0, 0), |sum, one| (sum.0 + one.0, sum.1 + one.1))
     }
 
-    /// Makes all observations in registered views inliers, of tracks that at least two such views observe. Tracks without a
-    /// point get one at the origin, to be replaced.
+    /// Makes all observations in registered views inliers, of tracks that at least two such views observe.
     pub(crate) fn activate_all(&mut self) {
         for track in 0..self.tracks.len() {
             if self.posed_observations(track).count() < 2 {
                 continue;
             }
-            self.points[track].get_or_insert_with(Point3::origin);
             for i in self.tracks.range(track) {
                 self.active[i] = self.poses[self.view_of(i)].is_some();
             }

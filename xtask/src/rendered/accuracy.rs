@@ -3,7 +3,7 @@
 use super::Walk;
 use crate::checks::Check;
 use anyhow::{Context, Result};
-use cv_core::{Camera, Correspondence, Distortion, Point2, Point3, Pose, Vector3, quantile};
+use cv_core::{Camera, Correspondence, Point2, Point3, Pose, Vector3, quantile};
 use cv_geometry::{align_points, triangulate};
 use cv_pipeline::many_views::{CameraKnowledge, Observation, SfmModel};
 use cv_pipeline::{SfmCamera, SfmJobOptions, SfmPhoto, Silent, sfm};
@@ -81,16 +81,9 @@ pub(super) fn street_gaps() -> Result<Vec<Check>> {
 fn check_walk(walk: &Walk, side: f64) -> Result<Vec<Check>> {
     let options = SfmJobOptions::default();
     let photos = walk.photos(&options)?;
-    let initial_camera = |focal: f64| Camera {
-        distortion: Distortion::radial(0.0, 0.0),
-        ..Camera::from_focal(walk.camera.width, walk.camera.height, focal)
-    };
     let known = SfmCamera { camera: walk.camera, knowledge: CameraKnowledge::Known };
-    // The program's initial value without EXIF.
-    let unknown =
-        SfmCamera { camera: initial_camera(1.2 * walk.camera.width as f64), knowledge: CameraKnowledge::Unknown };
     let mut checks = Vec::new();
-    for (name, camera) in [("camera known", known), ("camera unknown", unknown)] {
+    for (name, camera) in [("camera known", known), ("camera unknown", walk.unknown_camera())] {
         let result = sfm(&photos, &[camera], &options, &Silent)?;
         let model = result.models.first().context("no model")?;
         let errors = PoseErrors::of(model, &walk.poses)?;

@@ -9,8 +9,9 @@ mod self_calibration;
 
 use crate::checks::{self, Check};
 use anyhow::Result;
-use cv_core::{Camera, Pose, RgbU8};
-use cv_pipeline::{SfmJobOptions, SfmPhoto, Silent, sfm_photo};
+use cv_core::{Camera, Distortion, Pose, RgbU8};
+use cv_pipeline::many_views::CameraKnowledge;
+use cv_pipeline::{SfmCamera, SfmJobOptions, SfmPhoto, Silent, sfm_photo};
 use cv_synth::{RenderOptions, Scene, render};
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
@@ -47,6 +48,18 @@ struct Walk {
 impl Walk {
     fn new(scene: Scene, poses: Vec<Pose>) -> Self {
         Self { scene, poses, camera: Camera::from_focal(1200, 900, 900.0) }
+    }
+
+    /// Returns the program's initial camera without EXIF.
+    fn unknown_camera(&self) -> SfmCamera {
+        let camera = self.undistorted_camera(1.2 * self.camera.width as f64);
+        SfmCamera { camera, knowledge: CameraKnowledge::Unknown }
+    }
+
+    /// Returns a camera of the same size, without distortion.
+    fn undistorted_camera(&self, focal: f64) -> Camera {
+        let distortion = Distortion::radial(0.0, 0.0);
+        Camera { distortion, ..Camera::from_focal(self.camera.width, self.camera.height, focal) }
     }
 
     fn photograph(&self, camera: &Camera, index: usize) -> Result<RgbU8> {

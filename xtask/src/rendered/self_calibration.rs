@@ -24,7 +24,7 @@ pub(super) fn self_calibration() -> Result<Vec<Check>> {
     {
         let options = SfmJobOptions::default();
         let photos = walk.photos(&options)?;
-        for camera in [unknown(&walk), approximate(&walk)] {
+        for camera in [walk.unknown_camera(), approximate(&walk)] {
             let result = sfm(&photos, &[camera], &options, &Silent)?;
             let model = result.models.first().context("no model")?;
             let errors = PoseErrors::of(model, &walk.poses)?;
@@ -47,27 +47,17 @@ pub(super) fn self_calibration() -> Result<Vec<Check>> {
     let walk = rotation()?;
     let options = SfmJobOptions::default();
     let photos = walk.photos(&options)?;
-    for (name, camera) in [("unknown", unknown(&walk)), ("4 % off", approximate(&walk))] {
+    for (name, camera) in [("unknown", walk.unknown_camera()), ("4 % off", approximate(&walk))] {
         let models = sfm(&photos, &[camera], &options, &Silent).map_or(0, |result| result.models.len());
         checks.push(Check::at_most(format!("rotation only, focal length {name}: models"), models as f64, 0.0));
     }
     Ok(checks)
 }
 
-/// The program's initial camera without EXIF.
-fn unknown(walk: &Walk) -> SfmCamera {
-    SfmCamera { camera: undistorted(walk, 1.2 * walk.camera.width as f64), knowledge: CameraKnowledge::Unknown }
-}
-
 /// A focal length as EXIF has it.
 fn approximate(walk: &Walk) -> SfmCamera {
     let focal = 1.04 * walk.camera.fx;
-    SfmCamera { camera: undistorted(walk, focal), knowledge: CameraKnowledge::Focal { focal, deviation: 0.05 } }
-}
-
-fn undistorted(walk: &Walk, focal: f64) -> Camera {
-    let distortion = Distortion::radial(0.0, 0.0);
-    Camera { distortion, ..Camera::from_focal(walk.camera.width, walk.camera.height, focal) }
+    SfmCamera { camera: walk.undistorted_camera(focal), knowledge: CameraKnowledge::Focal { focal, deviation: 0.05 } }
 }
 
 /// Twelve views around a table, from one height and distance: two views whose optical axes intersect do not determine the

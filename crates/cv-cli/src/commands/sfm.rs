@@ -246,12 +246,11 @@ impl Args {
         }
         if let Some(model) = result.models.first().filter(|m| m.registered() <= MAX_VIEWS_OF_DEVIATIONS) {
             let deviations = sfm_focal_deviations(&photos, cameras.list(), model).unwrap_or_default();
-            deviations
-                .iter()
-                .zip(&model.cameras)
-                .filter_map(|(deviation, camera)| words::many_views::focal_uncertain(camera.fx, (*deviation)?))
-                .take(1)
-                .for_each(|text| context.warn(text));
+            let mut of_cameras = model.cameras.iter().zip(&deviations);
+            let warning = of_cameras.find_map(|(camera, of)| words::many_views::focal_uncertain(camera.fx, (*of)?));
+            if let Some(text) = warning {
+                context.warn(text);
+            }
         }
         context.report(|| report::report(&all, &registered, &models, &frames, &stages))?;
         let done = outcome(&all, &registered, &models, &frames, &result, checkpoint.reused(), stages);

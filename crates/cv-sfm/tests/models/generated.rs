@@ -140,6 +140,12 @@ fn walk(views: usize) -> FeatureViews {
     FeatureViews::new(&FeatureViewsOptions { views, points: 200 * views, ..FeatureViewsOptions::default() })
 }
 
+/// Returns a camera of the same size with a focal length and a distortion to be estimated.
+fn initial_camera(truth: &Camera, focal: f64) -> Camera {
+    let distortion = cv_core::Distortion::radial(0.0, 0.0);
+    Camera { distortion, ..Camera::from_focal(truth.width, truth.height, focal) }
+}
+
 #[test]
 fn a_closed_walk_is_reconstructed_accurately() {
     for (views, solver) in [(30, Solver::Global), (30, Solver::Incremental), (60, Solver::Auto)] {
@@ -161,10 +167,7 @@ fn a_closed_walk_is_reconstructed_accurately() {
 #[test]
 fn focal_length_and_distortion_are_estimated() {
     let truth = walk(40);
-    let start = |focal: f64| Camera {
-        distortion: cv_core::Distortion::radial(0.0, 0.0),
-        ..Camera::from_focal(truth.camera.width, truth.camera.height, focal)
-    };
+    let start = |focal: f64| initial_camera(&truth.camera, focal);
     let wrong = 1.05 * truth.camera.fx;
     for (knowledge, focal) in [
         (CameraKnowledge::Focal { focal: wrong, deviation: 0.03 }, wrong),
@@ -253,10 +256,7 @@ fn a_rotating_camera_gives_no_model() {
     let camera = truth.camera;
     // With an unknown lens, distortion can imitate parallax.
     let focal = 1.04 * camera.fx;
-    let start = |focal: f64| Camera {
-        distortion: cv_core::Distortion::radial(0.0, 0.0),
-        ..Camera::from_focal(camera.width, camera.height, focal)
-    };
+    let start = |focal: f64| initial_camera(&camera, focal);
     for start in [
         (CameraKnowledge::Known, camera),
         (CameraKnowledge::Focal { focal, deviation: 0.05 }, start(focal)),
@@ -290,7 +290,7 @@ fn an_unknown_focal_length_is_estimated_around_an_object() {
     };
     let poses: Vec<Pose> = (0..12).map(pose).collect();
     let camera = Camera::from_focal(1000, 750, 780.0);
-    let start = Camera { distortion: cv_core::Distortion::radial(0.0, 0.0), ..Camera::from_focal(1000, 750, 1200.0) };
+    let start = initial_camera(&camera, 1200.0);
     let dataset = Dataset::of_points(&points, &poses, &camera, (CameraKnowledge::Unknown, start));
     let found = dataset.solve().unwrap();
     assert_eq!(found.models[0].registered(), 12, "{:?}", found.views);
@@ -315,10 +315,7 @@ fn a_focal_length_that_translations_do_not_determine_has_a_large_deviation() {
     };
     let poses: Vec<Pose> = (0..6).map(pose).collect();
     let wrong = 1.04 * camera.fx;
-    let start = Camera {
-        distortion: cv_core::Distortion::radial(0.0, 0.0),
-        ..Camera::from_focal(camera.width, camera.height, wrong)
-    };
+    let start = initial_camera(&camera, wrong);
     for knowledge in [CameraKnowledge::Unknown, CameraKnowledge::Focal { focal: wrong, deviation: 0.05 }] {
         let dataset = Dataset::of_points(&truth.points, &poses, &camera, (knowledge, start));
         let found = dataset.solve().unwrap();
