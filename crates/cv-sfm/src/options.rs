@@ -28,7 +28,7 @@ cv_core::named!(Solver {
     Global = "global": "all poses at once from those of the pairs",
 });
 
-/// Settings of [`reconstruct_views`].
+/// Settings of [`reconstruct_views`](crate::reconstruct_views).
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "serde", serde(default))]
