@@ -8,9 +8,6 @@ use cv_core::{Correspondence, Image, ImageView};
 use cv_imgproc::Pixel;
 use cv_stereo::{Intensity, RectifyError, StereoError, StereoOptions, VerticalOffset};
 
-/// Fraction of matched and confirmed pixels below which features estimate the offset if blocks do not: an offset of a
-/// pixel removes a third to a half of the matches of aligned pairs, which have 63 to 99 %.
-const MIN_MATCHED_FRACTION: f64 = 0.6;
 /// Largest offset in px that blocks estimate reliably, within their search range.
 const MAX_BLOCK_OFFSET: f64 = 1.5;
 /// Minimum inlier ratio of feature matches.
@@ -24,6 +21,8 @@ pub(crate) struct Alignment {
     /// Whether estimation has ended: the offset is known, or cannot be determined.
     is_closed: bool,
     attempts: u8,
+    has_tried_features: bool,
+    /// Until estimation has ended, that of features.
     pub(crate) offset: Option<VerticalOffset>,
 }
 
@@ -33,11 +32,12 @@ impl Alignment {
         Self { is_closed: true, ..Self::default() }
     }
 
-    /// Uses the offset of feature matches if it is larger than blocks can estimate (blocks are more accurate).
+    /// Uses the offset of feature matches if it is larger than blocks can estimate.
     pub(crate) fn update_from_features(&mut self, matches: &[Correspondence], size: (usize, usize)) {
-        let estimate = estimate_from_features(matches, size);
-        if let Some(offset) = estimate.filter(|offset| !self.is_closed && offset.largest() > MAX_BLOCK_OFFSET) {
-            self.close(Some(offset));
+        if !self.is_closed {
+            self.has_tried_features = true;
+            let estimate = estimate_from_features(matches, size);
+            self.offset = estimate.filter(|offset| offset.largest() > MAX_BLOCK_OFFSET && offset.is_to_correct());
         }
     }
 
@@ -47,8 +47,10 @@ impl Alignment {
         self.offset = offset.filter(VerticalOffset::is_to_correct);
     }
 
-    /// Estimates the vertical disparity of a pair if it is not known, from blocks near the disparities of a coarse match with these options; from
-    /// features if blocks are not enough. Returns whether a correction begins with this pair: previous ones of a film were not corrected.
+    /// Estimates the vertical disparity of a pair if it is not known, from blocks near the disparities of a coarse match with these options. A larger
+    /// one than blocks can estimate, or blocks that disagree, which they do with an offset beyond their search range: from features, and
+    /// then from blocks of the corrected pair, which are more accurate. Returns whether a correction begins with this pair: previous ones of a film were
+    /// not corrected.
     pub(crate) fn estimate<T: Intensity + Pixel, const C: usize>(
         &mut self,
         [left, right]: [ImageView<'_, T, C>; 2],
@@ -60,25 +62,30 @@ impl Alignment {
             return Ok(false);
         }
         self.attempts += 1;
-        let (estimate, matched_fraction) = match VerticalOffset::estimate([left, right], options, progress) {
-            Ok(estimate) => estimate,
-            Err(StereoError::Cancelled(stop)) => return Err(stop.into()),
-            // The matcher of the whole pair reports what is wrong with it.
-            Err(_) => {
-                self.close(None);
-                return Ok(false);
+        if self.offset.is_none() {
+            let from_blocks = estimate_from_blocks([left, right], options, progress)?;
+            if from_blocks.is_some_and(|offset| offset.largest() <= MAX_BLOCK_OFFSET) {
+                self.close(from_blocks);
+                return Ok(self.offset.is_some());
             }
-        };
-        if let Some(offset) = estimate.filter(|offset| offset.largest() <= MAX_BLOCK_OFFSET) {
-            self.close(Some(offset));
-        } else if estimate.is_some() || matched_fraction < MIN_MATCHED_FRACTION {
             // Once only: in a film, features would take most of the time.
-            let [a, b] = [left, right].map(to_rgb8);
-            match match_pair(a.view(), b.view(), progress) {
-                Ok(matches) => self.close(estimate_from_features(&matches, left.size())),
-                Err(RangeError::Cancelled(stop)) => return Err(stop.into()),
-                Err(_) => self.close(None),
+            if !self.has_tried_features {
+                self.has_tried_features = true;
+                let [a, b] = [left, right].map(to_rgb8);
+                let from_features = match match_pair(a.view(), b.view(), progress) {
+                    Ok(matches) => estimate_from_features(&matches, left.size()),
+                    Err(RangeError::Cancelled(stop)) => return Err(stop.into()),
+                    Err(_) => None,
+                };
+                self.offset = from_features.filter(VerticalOffset::is_to_correct);
             }
+        }
+        if let Some(offset) = self.offset {
+            let corrected = self.correct(right)?;
+            let right = corrected.as_ref().map_or(right, Image::view);
+            let rest = estimate_from_blocks([left, right], options, progress)?;
+            let rest = rest.filter(|rest| rest.largest() <= MAX_BLOCK_OFFSET);
+            self.close(Some(rest.map_or(offset, |rest| offset + rest)));
         } else if self.attempts == MAX_ATTEMPTS {
             self.close(None);
         }
@@ -94,6 +101,19 @@ impl Alignment {
         let offset = self.offset.filter(|offset| offset.size == (width, height));
         let corrected = offset.map(|offset| offset.correct(right)).transpose();
         corrected.map_err(|_| DepthError::Rectify(RectifyError::TooLarge { width, height }))
+    }
+}
+
+/// Estimates the offset from blocks; `None` where they disagree. What is wrong with a pair, the matcher reports.
+fn estimate_from_blocks<T: Intensity, const C: usize>(
+    images: [ImageView<'_, T, C>; 2],
+    options: &StereoOptions,
+    progress: &dyn Progress,
+) -> Result<Option<VerticalOffset>, DepthError> {
+    match VerticalOffset::estimate(images, options, progress) {
+        Ok(estimate) => Ok(estimate),
+        Err(StereoError::Cancelled(stop)) => Err(stop.into()),
+        Err(_) => Ok(None),
     }
 }
 
