@@ -47,6 +47,7 @@ fn matching_options(options: &mut Options<'_>, o: &mut StereoOptions) -> PyResul
     options.set_named("smoothing", &mut o.smoothing)?;
     options.set("fill", &mut o.fill)?;
     options.set("ignore_black_borders", &mut o.ignore_black_borders)?;
+    options.set("denoise", &mut o.denoise)?;
     options.set("quality", &mut o.quality)?;
     options.set_optional("max_memory", &mut o.max_memory)
 }

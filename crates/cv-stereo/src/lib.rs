@@ -25,6 +25,7 @@ mod census;
 mod coarse_prior;
 mod confidence;
 mod cost;
+mod denoise;
 mod depth;
 mod disparity_map;
 mod disparity_matcher;

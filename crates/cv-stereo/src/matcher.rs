@@ -7,6 +7,7 @@ use crate::census::{Gray, describe, describe_mirrored, planes};
 use crate::coarse_prior::Prior;
 use crate::confidence::{confidence, sigma};
 use crate::cost::{Frame, Penalties};
+use crate::denoise;
 use crate::disparity_map::{DisparityMap, PixelState};
 use crate::edge_preserving::{SmoothingBuffers, smooth};
 use crate::fill_cost::Pair;
@@ -163,7 +164,11 @@ impl StereoMatcher {
                 return Err(StereoError::NotFinite { side, count });
             }
         }
+        let is_noisy = self.options.denoise && denoise::is_noisy(&self.gray);
         self.borders.update(&mut self.gray, self.options.ignore_black_borders, &mut self.scratch);
+        if is_noisy {
+            self.gray.iter_mut().for_each(|gray| denoise::smooth(gray, &mut self.scratch));
+        }
         if self.options.sequence {
             for (frame, gray) in self.frames.iter_mut().zip(&mut self.gray) {
                 frame.filter(gray);

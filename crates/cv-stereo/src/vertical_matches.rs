@@ -86,6 +86,7 @@ pub(crate) fn match_coarsely(
         smoothing: Smoothing::None,
         fill: false,
         quality: false,
+        denoise: false,
         sequence: false,
         confidence: false,
         ..options.clone()

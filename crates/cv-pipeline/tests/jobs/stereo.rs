@@ -227,6 +227,42 @@ fn a_vertical_disparity_of_several_pixels_is_estimated_from_features_and_blocks(
 }
 
 #[test]
+fn noisy_pairs_are_smoothed_and_others_are_not() {
+    let mut wrong = [0_usize; 2];
+    for RenderedScene { name, pair, .. } in SCENES.iter().take(2) {
+        let mut state = 1_u64;
+        // Three uniform numbers with a variance of 1/12 each: a standard deviation of 8 levels.
+        let mut noise = || {
+            let mut uniform = || {
+                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                (state >> 40) as f64 / f64::from(1 << 24) - 0.5
+            };
+            16.0 * (uniform() + uniform() + uniform())
+        };
+        let noisy = [&pair.left, &pair.right].map(|view| {
+            view.image.map(|pixel| pixel.map(|v| (f64::from(v) + noise()).round().clamp(0.0, 255.0) as u8))
+        });
+        let matched = |left: &RgbU8, right: &RgbU8, denoise| {
+            let options = StereoOptions { disparities: 96, denoise, ..StereoOptions::default() };
+            StereoMatcher::new(options).unwrap().compute(left.view(), right.view(), &Silent).unwrap()
+        };
+        let [with, without] = [true, false].map(|denoise| matched(&noisy[0], &noisy[1], denoise));
+        let bad = |map: &DisparityMap| {
+            let all = map.disparity.as_slice().iter().zip(pair.disparity.as_slice()).zip(pair.visible.as_slice());
+            all.filter(|((d, truth), seen)| **seen && (**d - **truth).abs() > 2.0).count()
+        };
+        let counts = [bad(&with), bad(&without)];
+        println!("{name}: {counts:?} wrong pixels, smoothed and not");
+        wrong = [0, 1].map(|i| wrong[i] + counts[i]);
+        let [with, without] = [true, false].map(|denoise| matched(&pair.left.image, &pair.right.image, denoise));
+        let bits = |map: &DisparityMap| map.disparity.as_slice().iter().map(|d| d.to_bits()).collect::<Vec<_>>();
+        assert!(bits(&with) == bits(&without), "{name}: smoothed without noise");
+    }
+    // A third fewer are expected from public pairs.
+    assert!(wrong[0] * 4 < wrong[1] * 3, "{wrong:?}");
+}
+
+#[test]
 fn strips_of_rows_take_less_memory_and_hardly_change_the_result() {
     for RenderedScene { name, pair, .. } in SCENES.iter().take(2) {
         let whole = matched(pair, pair);
