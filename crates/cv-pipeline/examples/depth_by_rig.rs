@@ -16,7 +16,7 @@ pub(crate) fn main() -> Result<(), Box<dyn std::error::Error>> {
 
     let rig = StereoRig { left: camera, right: camera, right_from_left };
     let rectification = Rectification::new(&rig, &RectifyOptions::default())?;
-    let options = DepthOptions { disparities: DisparityRange::FromMatches { min: None }, ..DepthOptions::default() };
+    let options = DepthOptions { disparities: DisparityRange::Auto { min: None }, ..DepthOptions::default() };
     let result = depth_by_rig(left.view(), right.view(), &rectification, &options, &Silent)?;
 
     println!("smallest disparity and number of them: {:?}", result.maps.disparities);

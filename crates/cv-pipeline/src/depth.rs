@@ -1,6 +1,6 @@
 //! Disparity and depth of a rectified pair.
 
-use crate::disparity_range::{is_exchanged, match_pair, range_from_matches};
+use crate::disparity_range::image_range;
 use crate::no_pair::{FeatureAgreement, FewMatches, NoPairCause, diagnose};
 use crate::vertical_alignment::Alignment;
 use crate::{Progress, RangeError};
@@ -19,9 +19,8 @@ pub enum DisparityRange {
     /// Those of [`StereoOptions::min_disparity`] and [`StereoOptions::disparities`].
     #[default]
     Given,
-    /// The range of feature matches ([`disparity_range`](crate::disparity_range())), from `min` px up where it is
-    /// given.
-    FromMatches {
+    /// That of the images ([`disparity_range`](crate::disparity_range())), from `min` px up where it is given.
+    Auto {
         /// Smallest disparity, in px.
         min: Option<i32>,
     },
@@ -256,34 +255,11 @@ pub(crate) fn matcher_options<T: Intensity + Pixel, const C: usize>(
 ) -> Result<StereoOptions, DepthError> {
     Ok(match options.disparities {
         DisparityRange::Given => options.stereo.clone(),
-        DisparityRange::FromMatches { min } => {
-            let (min_disparity, disparities) = feature_range([left, right], min, alignment, progress)?;
+        DisparityRange::Auto { min } => {
+            let (min_disparity, disparities) = image_range([left, right], min, &options.stereo, alignment, progress)?;
             StereoOptions { min_disparity, disparities, ..options.stereo.clone() }
         }
     })
-}
-
-/// Returns the smallest disparity (`min` where given) and the number of disparities of a pair's feature matches.
-fn feature_range<T: Intensity, const C: usize>(
-    [left, right]: [ImageView<'_, T, C>; 2],
-    min: Option<i32>,
-    alignment: &mut Alignment,
-    progress: &dyn Progress,
-) -> Result<(i32, usize), DepthError> {
-    let mut matches = match_pair(to_rgb8(left).view(), to_rgb8(right).view(), progress)?;
-    if left.size() == right.size() {
-        alignment.update_from_features(&matches, left.size());
-    }
-    if let Some(offset) = alignment.offset {
-        offset.correct_matches(&mut matches);
-    }
-    let (first, count) = range_from_matches(&matches)?;
-    let range = (first, first + count as i32 - 1);
-    if min.is_none() && is_exchanged(range) {
-        return Err(RangeError::Exchanged { range }.into());
-    }
-    let min_disparity = min.unwrap_or(first);
-    Ok((min_disparity, (i64::from(first) + count as i64 - i64::from(min_disparity)).max(1) as usize))
 }
 
 /// Computes the disparity of a rectified pair, and the depth where its geometry is known.

@@ -10,7 +10,7 @@ use cv_stereo::{
 };
 use std::any::Any;
 
-/// Matches the frames of a film with one allocation and one range of disparities. With [`DisparityRange::FromMatches`],
+/// Matches the frames of a film with one allocation and one range of disparities. With [`DisparityRange::Auto`],
 /// the first frame determines the range. With [`FrameDepth::forget`] also pairs that are not of one film.
 #[derive(Debug)]
 pub struct FrameDepth {
@@ -59,7 +59,7 @@ impl FrameDepth {
     }
 
     /// Makes the next pair independent of the previous ones: its vertical disparity and, with
-    /// [`DisparityRange::FromMatches`], its range are determined anew. Memory and warp maps are kept.
+    /// [`DisparityRange::Auto`], its range are determined anew. Memory and warp maps are kept.
     pub fn forget(&mut self) {
         self.alignment = initial_alignment(&self.options);
         self.matcher = self.matcher.take().filter(|_| fits_all_pairs(&self.options));

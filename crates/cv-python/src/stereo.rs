@@ -75,7 +75,7 @@ impl DepthArguments {
                 if given.extract::<String>()? != "auto" {
                     return Err(PyValueError::new_err("depth(): disparities must be a number or “auto”"));
                 }
-                o.disparities = DisparityRange::FromMatches { min };
+                o.disparities = DisparityRange::Auto { min };
             } else {
                 o.stereo.disparities = options.extract("disparities", &given)?;
             }

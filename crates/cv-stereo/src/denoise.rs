@@ -5,6 +5,8 @@ use cv_parallel::prelude::*;
 
 /// Side of the blocks in which noise is measured, in px.
 const BLOCK: usize = 16;
+/// Pixels across a block at half resolution, without its border.
+const HALVED: usize = BLOCK / 2 - 2;
 /// Maximum number of blocks across and down.
 const MAX_BLOCKS: usize = 32;
 /// Minimum number of blocks with unclipped pixels.
@@ -16,13 +18,17 @@ const QUANTILE: f64 = 0.05;
 /// Noise, as a ratio of the contrast of the image, from which on it is smoothed. Public pairs, without noise to speak of, have up to 0.02, one with fine
 /// texture everywhere 0.043; with a noise of 4 levels of gray added, of 255, 0.05 to 0.11.
 const MIN_NOISE: f64 = 0.05;
-/// Taps of the smoothing, in 256ths: a Gaussian of σ 0.9 px.
-const TAPS: [f32; 3] = [114.0, 61.0, 10.0];
+/// Noise of the median block up to which it is: an image of nothing but noise has 1, and smoothed, more chance matches.
+const MAX_NOISE: f64 = 0.6;
+/// Minimum ratio of the noise to that at half resolution.
+const MIN_WHITENESS: f64 = 1.5;
+/// Taps of the smoothing, in 256ths: a Gaussian of σ 0.75 px. A wider one leaves fewer errors under strong noise, but more chance matches where there is nothing
+/// but noise.
+const TAPS: [f32; 3] = [136.0, 56.0, 4.0];
 
-/// Estimates the standard deviation of the noise of an image as a ratio of that of its gray levels (Immerkær, "Fast noise variance estimation", CVIU 1996: the
-/// mean absolute response of a difference of two Laplacians, to which surfaces of constant curvature do not contribute), in the blocks with least
-/// texture. `None` for small images and if most pixels are clipped.
-pub(crate) fn relative_noise(gray: &Gray) -> Option<f64> {
+/// Estimates the noise of an image (Immerkær, "Fast noise variance estimation", CVIU 1996: the mean absolute response of a difference of two Laplacians, to which
+/// surfaces of constant curvature do not contribute), in the blocks with least texture. `None` for small images and if most pixels are clipped.
+fn noise(gray: &Gray) -> Option<Noise> {
     let starts = |length: usize| {
         // A pixel of space on each side.
         let blocks = length.saturating_sub(2) / BLOCK;
@@ -39,21 +45,45 @@ pub(crate) fn relative_noise(gray: &Gray) -> Option<f64> {
     if blocks.len() < MIN_BLOCKS {
         return None;
     }
-    let mut responses: Vec<u64> = blocks.iter().map(|block| block.responses).collect();
-    responses.sort_unstable();
-    let pixels = (BLOCK * BLOCK) as f64;
-    // The mask has a norm of six, and the mean absolute value of a normal distribution is √(2/π) σ.
-    let noise = (std::f64::consts::PI / 2.0).sqrt() / 6.0
-        * (responses[(QUANTILE * responses.len() as f64) as usize] as f64 / pixels);
-    let count = pixels * blocks.len() as f64;
+    let quantile = |response: fn(&Block) -> u64, pixels: usize, fraction: f64| {
+        let mut responses: Vec<u64> = blocks.iter().map(response).collect();
+        responses.sort_unstable();
+        // The mask has a norm of six, and the mean absolute value of a normal distribution is √(2/π) σ.
+        let factor = (std::f64::consts::PI / 2.0).sqrt() / (6 * pixels) as f64;
+        factor * responses[(fraction * responses.len() as f64) as usize] as f64
+    };
+    let count = (BLOCK * BLOCK * blocks.len()) as f64;
     let mean = blocks.iter().map(|block| block.sum).sum::<u64>() as f64 / count;
-    let variance = blocks.iter().map(|block| block.squares).sum::<u64>() as f64 / count - mean * mean;
-    (variance > 0.0).then(|| noise / variance.sqrt())
+    let contrast = (blocks.iter().map(|block| block.squares).sum::<u64>() as f64 / count - mean * mean).sqrt();
+    let noise = quantile(|block| block.responses, BLOCK * BLOCK, QUANTILE);
+    (contrast > 0.0).then(|| Noise {
+        relative: noise / contrast,
+        median: quantile(|block| block.responses, BLOCK * BLOCK, 0.5) / contrast,
+        // Of sums of four pixels.
+        whiteness: noise / (quantile(|block| block.halved, HALVED * HALVED, QUANTILE) / 4.0),
+    })
 }
 
-/// Returns whether both images of a pair are so noisy that smoothing them improves their matches.
+/// The noise of an image.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Noise {
+    /// Standard deviation as a ratio of that of the gray levels.
+    relative: f64,
+    /// That of the median block, with its texture.
+    median: f64,
+    /// As a ratio of that at half resolution: 2 for independent noise, about 1 for fine texture.
+    whiteness: f64,
+}
+
+impl Noise {
+    fn is_to_smooth(&self) -> bool {
+        self.relative >= MIN_NOISE && self.median <= MAX_NOISE && self.whiteness >= MIN_WHITENESS
+    }
+}
+
+/// Returns whether both images of a pair are so noisy, and yet not nothing but noise, that smoothing them improves their matches.
 pub(crate) fn is_noisy(pair: &[Gray; 2]) -> bool {
-    pair.iter().all(|gray| relative_noise(gray).is_some_and(|noise| noise >= MIN_NOISE))
+    pair.iter().all(|gray| noise(gray).is_some_and(|noise| noise.is_to_smooth()))
 }
 
 /// Sums over the pixels of a block.
@@ -61,6 +91,8 @@ pub(crate) fn is_noisy(pair: &[Gray; 2]) -> bool {
 struct Block {
     /// Absolute responses of the mask.
     responses: u64,
+    /// Those at half resolution, of sums of four pixels.
+    halved: u64,
     sum: u64,
     squares: u64,
     unclipped: usize,
@@ -80,6 +112,19 @@ impl Block {
                 block.squares += value * value;
                 // The first and last level of eight bits.
                 block.unclipped += usize::from((1 << 8..0xff << 8).contains(&here[i]));
+            }
+        }
+        let sums: [[i64; HALVED + 2]; HALVED + 2] = std::array::from_fn(|j| {
+            let [upper, lower] = [row(y + 2 * j), row(y + 2 * j + 1)];
+            std::array::from_fn(|i| {
+                [upper, lower].iter().map(|row| i64::from(row[2 * i + 1]) + i64::from(row[2 * i + 2])).sum()
+            })
+        });
+        for j in 1..=HALVED {
+            for i in 1..=HALVED {
+                let across = |row: &[i64; HALVED + 2]| row[i - 1] - 2 * row[i] + row[i + 1];
+                let [above, here, below] = [j - 1, j, j + 1].map(|j| across(&sums[j]));
+                block.halved += (above - 2 * here + below).unsigned_abs();
             }
         }
         block
@@ -158,17 +203,31 @@ mod tests {
     #[test]
     fn noise_is_estimated_relative_to_the_contrast() {
         for sigma in [1.0, 3.0, 6.0] {
-            let found = relative_noise(&gray(&waves(sigma))).unwrap();
+            let found = noise(&gray(&waves(sigma))).unwrap().relative;
             // A twentieth of the blocks, of 256 correlated pixels each: 8 % lower. Rounding adds 0.08.
             let expected = sigma / f64::hypot(40.0, sigma);
             assert!((0.8..1.1).contains(&(found / expected)), "{sigma}: {found} of {expected}");
         }
         // Of the same image at a quarter of its contrast.
         let dark = waves(6.0).map(|[v]| [40 + v / 4]);
-        let ratio = relative_noise(&gray(&dark)).unwrap() / relative_noise(&gray(&waves(6.0))).unwrap();
+        let ratio = noise(&gray(&dark)).unwrap().relative / noise(&gray(&waves(6.0))).unwrap().relative;
         // Rounding.
         assert!((ratio - 1.0).abs() < 0.1, "{ratio}");
         assert!(is_noisy(&[gray(&dark), gray(&waves(3.0))]) && !is_noisy(&[gray(&dark), gray(&waves(1.0))]));
+        let mut state = 3;
+        let nothing_else = GrayU8::from_fn(200, 150, |_, _| [(128.0 + 20.0 * normal(&mut state)).round() as u8]);
+        assert!(!is_noisy(&[gray(&nothing_else), gray(&nothing_else)]));
+    }
+
+    #[test]
+    fn fine_texture_is_not_noise() {
+        let whiteness = |image: &GrayU8| noise(&gray(image)).unwrap().whiteness;
+        // Quantiles of blocks with 256 and 36 pixels: those of the latter are lower.
+        assert!((1.9..2.6).contains(&whiteness(&waves(6.0))), "{}", whiteness(&waves(6.0)));
+        // Spots of three pixels, as strong as the noise.
+        let coarse = waves(6.0);
+        let spots = GrayU8::from_fn(200, 150, |x, y| coarse.at(x / 3, y / 3));
+        assert!(whiteness(&spots) < 1.2 && !is_noisy(&[gray(&spots), gray(&spots)]), "{}", whiteness(&spots));
     }
 
     #[test]
@@ -181,11 +240,12 @@ mod tests {
             (GrayU8::new(200, 150, [77]), "one color"),
             (GrayU8::from_fn(200, 150, |_, _| [(250.0 + 20.0 * normal(&mut state)) as u8]), "clipped"),
         ] {
-            assert_eq!(relative_noise(&gray(&image)), None, "{why}");
+            assert_eq!(noise(&gray(&image)), None, "{why}");
         }
         // Black borders do not count.
-        let framed = GrayU8::from_fn(400, 150, |x, y| if x < 200 { waves(6.0).at(x, y) } else { [0] });
-        let (with, without) = (relative_noise(&gray(&framed)).unwrap(), relative_noise(&gray(&waves(6.0))).unwrap());
+        let whole = waves(6.0);
+        let framed = GrayU8::from_fn(400, 150, |x, y| if x < 200 { whole.at(x, y) } else { [0] });
+        let [with, without] = [&framed, &whole].map(|image| noise(&gray(image)).unwrap().relative);
         assert!((with / without - 1.0).abs() < 0.2, "{with} {without}");
     }
 
@@ -207,7 +267,7 @@ mod tests {
         let sum: f64 = (0..21).flat_map(|y| (0..21).map(move |x| (x, y))).map(|(x, y)| at(x, y)).sum();
         let variance: f64 = (0..21).map(|x| (x as f64 - 10.0).powi(2) * at(x, 10)).sum::<f64>()
             / (0..21).map(|x| at(x, 10)).sum::<f64>();
-        // Rounding of 25 pixels; two taps on each side of a σ of 0.9.
-        assert!((sum - 1.0).abs() < 1e-3 && (variance.sqrt() - 0.9).abs() < 0.02, "{sum} {variance}");
+        // Rounding of 25 pixels; two taps on each side of a σ of 0.75.
+        assert!((sum - 1.0).abs() < 1e-3 && (variance.sqrt() - 0.75).abs() < 0.02, "{sum} {variance}");
     }
 }

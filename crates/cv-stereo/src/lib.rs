@@ -22,6 +22,7 @@ mod aligned_buffer;
 mod border_mask;
 mod buffer_pool;
 mod census;
+mod coarse_match;
 mod coarse_prior;
 mod confidence;
 mod cost;
@@ -65,6 +66,7 @@ mod window_sweep;
 mod winner;
 mod winner_checks;
 
+pub use coarse_match::CoarseRange;
 pub use depth::{GeometryError, StereoGeometry};
 pub use disparity_map::{DisparityMap, PixelState};
 pub use disparity_matcher::DisparityMatcher;

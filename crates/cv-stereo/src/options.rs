@@ -208,7 +208,7 @@ pub struct StereoOptions {
     /// (0.5 % of it or more) or along 0.4 of a side (0.1 % or more), with a smooth outline. Their pixels are [`crate::PixelState::NoData`]. Default true. Masks
     /// ([`crate::StereoMatcher::set_masks`]) take precedence.
     pub ignore_black_borders: bool,
-    /// Whether a noisy pair is smoothed before it is matched (a Gaussian of σ 0.9 px): if in both images the noise is a twentieth or more of the
+    /// Whether a noisy pair is smoothed before it is matched (a Gaussian of σ 0.75 px): if in both images the noise is a twentieth or more of the
     /// contrast, as at night. With a noise of 6 levels of 255 in each channel, errors above 2 px fall by a third. Default true.
     pub denoise: bool,
     /// Quality mode: local expansion moves over slanted planes (Taniai et al., PAMI 2018) after semi-global matching. Takes about forty-five times

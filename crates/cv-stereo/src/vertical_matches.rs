@@ -1,13 +1,9 @@
 //! Vertical disparity at matched pixels: block matching up and down, near the column of a coarse disparity.
 
-use crate::{DisparityMap, Intensity, Paths, PixelState, Smoothing, StereoError, StereoMatcher, StereoOptions};
-use cv_core::{GrayF32, ImageView, Point2, Progress};
-use cv_imgproc::gaussian_blur;
+use crate::coarse_match::CoarseDisparity;
+use cv_core::{GrayF32, Point2};
 use cv_parallel::prelude::*;
 
-/// Maximum number of costs (pixels times disparities) of the coarse images, which are half the size or smaller. With 10⁶ to 2·10⁸ the offsets of
-/// public pairs differ by hundredths of a pixel.
-const MAX_COARSE_COSTS: usize = 2_000_000;
 /// Number of cells across and down; one pixel is sampled in each.
 const CELLS: (usize, usize) = (48, 32);
 /// Block radius (horizontal, vertical) in px.
@@ -31,8 +27,6 @@ const HORIZONTAL_DAMPING: f32 = 0.01;
 const ITERATIONS: usize = 4;
 /// Minimum vertical difference of gray levels of a sampled pixel, on a range of 0 to 1 and after smoothing.
 const MIN_VERTICAL_GRADIENT: f32 = 0.01;
-/// Standard deviation in px of the smoothing of gray levels.
-const SIGMA: f32 = 1.2;
 /// Variance of gray levels by which that of the residuals is increased: quantization of 8 bits, twice, after smoothing.
 const MIN_VARIANCE: f32 = 1e-5;
 
@@ -44,84 +38,6 @@ pub(crate) struct VerticalMatch {
     pub(crate) offset: f64,
     /// Inverse variance, up to a factor.
     pub(crate) weight: f64,
-}
-
-/// The disparities of a pair at a fraction of its size.
-pub(crate) struct CoarseDisparity {
-    pub(crate) map: DisparityMap,
-    /// Pixels of the pair per pixel of the map.
-    scale: usize,
-}
-
-impl CoarseDisparity {
-    /// Returns the disparity at a pixel of the pair, in its px; `None` if it is not matched.
-    fn at(&self, x: usize, y: usize) -> Option<f32> {
-        let (x, y) = (x / self.scale, y / self.scale);
-        let (width, height) = self.map.disparity.size();
-        let is_matched = x < width && y < height && self.map.state.at(x, y)[0] == PixelState::Matched;
-        is_matched.then(|| self.scale as f32 * self.map.disparity.at(x, y)[0])
-    }
-}
-
-/// Matches a pair at half its size, or smaller if it is large. The options are valid.
-pub(crate) fn match_coarsely(
-    gray: [&GrayF32; 2],
-    options: &StereoOptions,
-    progress: &dyn Progress,
-) -> Result<CoarseDisparity, StereoError> {
-    let (width, height) = gray[0].size();
-    let mut scale = 2;
-    while (width / scale) * (height / scale) * (options.disparities / scale) > MAX_COARSE_COSTS {
-        scale *= 2;
-    }
-    let [left, right] = gray.map(|gray| mean_blocks(gray, scale));
-    // Halves of 32-bit integers: they fit.
-    let first = i64::from(options.min_disparity);
-    let [first, last] = [first, first + options.disparities as i64 - 1].map(|d| d.div_euclid(scale as i64));
-    let options = StereoOptions {
-        min_disparity: first as i32,
-        disparities: (last - first) as usize + 2,
-        pyramid_levels: 0,
-        paths: Paths::Four,
-        smoothing: Smoothing::None,
-        fill: false,
-        quality: false,
-        denoise: false,
-        sequence: false,
-        confidence: false,
-        ..options.clone()
-    };
-    let map = StereoMatcher::new(options)?.compute(left.view(), right.view(), progress)?;
-    Ok(CoarseDisparity { map, scale })
-}
-
-/// Downsamples by a factor: each pixel is the mean of a block, without incomplete ones.
-fn mean_blocks(image: &GrayF32, scale: usize) -> GrayF32 {
-    let factor = 1.0 / (scale * scale) as f32;
-    let mut small = GrayF32::new(image.width() / scale, image.height() / scale, [0.0]);
-    for y in 0..small.height() {
-        for row in scale * y..scale * (y + 1) {
-            for (mean, block) in small.row_mut(y).iter_mut().zip(image.row(row).chunks_exact(scale)) {
-                *mean += factor * block.iter().sum::<f32>();
-            }
-        }
-    }
-    small
-}
-
-/// Converts an image to gray levels of 0 to 1, smoothed for the interpolation of blocks: without, bilinear interpolation smooths between
-/// pixels and moves minima there.
-pub(crate) fn smoothed_gray<T: Intensity, const C: usize>(view: ImageView<'_, T, C>) -> GrayF32 {
-    let mut gray = GrayF32::new(view.width(), view.height(), [0.0]);
-    let rows = gray.as_mut_slice().par_chunks_mut(view.width().max(1)).enumerate();
-    rows.for_each_init(
-        || vec![0; view.width()],
-        |levels, (y, row)| {
-            T::gray_row(view.row(y), C, levels);
-            row.iter_mut().zip(levels).for_each(|(gray, level)| *gray = f32::from(*level) / 65535.0);
-        },
-    );
-    gaussian_blur(gray.view(), SIGMA)
 }
 
 /// Estimates subpixel vertical disparities: in each cell, at the matched pixel with the largest vertical gradient. Linear in the number of

@@ -4,7 +4,7 @@ use super::Check;
 use anyhow::{Result, ensure};
 use cv_core::{GrayF32, Mask};
 use cv_pipeline::stereo::{PixelState, StereoOptions, evaluate_disparity, non_occluded};
-use cv_pipeline::{DepthOptions, Silent, depth};
+use cv_pipeline::{DepthOptions, Silent, depth, disparity_range};
 use std::path::Path;
 
 /// A pair, its ground truth, and the scores of peers on it.
@@ -151,5 +151,27 @@ pub(crate) fn run(data: &Path) -> Result<Vec<Check>> {
     }
     checks.push(Check::at_most("mean bad-1.0 %, 0.9 of Pandora's", sums[0], 0.9 * sums[1]));
     checks.push(Check::at_most("mean bad-2.0 %, 0.9 of Pandora's", sums[2], 0.9 * sums[3]));
+    checks.push(outside_estimated_range(&data.join("stereo-more"))?);
     Ok(checks)
+}
+
+/// Estimates the range of disparities of every pair with a ground truth: the largest fraction of the truth that lies outside.
+fn outside_estimated_range(folder: &Path) -> Result<Check> {
+    let mut folders: Vec<_> = std::fs::read_dir(folder)?.map(|f| Ok(f?.path())).collect::<Result<_>>()?;
+    folders.sort();
+    let mut worst: f64 = 0.0;
+    for folder in folders.iter().filter(|folder| folder.join("truth.png").exists()) {
+        let [left, right] = ["left.png", "right.png"].map(|name| cv_io::read_rgb(folder.join(name)));
+        let (first, count) = disparity_range(left?.view(), right?.view(), &Silent)?;
+        let last = first + count as i32 - 1;
+        let truth = cv_io::scaled::read(folder.join("truth.png"), 256.0)?;
+        let known: Vec<f32> = truth.as_slice().iter().copied().filter(|d| d.is_finite()).collect();
+        // Half a pixel: disparities are refined beyond the last one that is searched.
+        let is_outside = |d: &&f32| **d < first as f32 - 0.5 || **d > last as f32 + 0.5;
+        let percent = 100.0 * known.iter().filter(is_outside).count() as f64 / known.len().max(1) as f64;
+        println!("{}: range {first} to {last}, {percent:.2} % outside", folder.display());
+        worst = worst.max(percent);
+    }
+    // What is seen by the left camera only may be nearer than all that is matched.
+    Ok(Check::at_most("ground truth outside the estimated range of disparities, worst pair, %", worst, 1.0))
 }

@@ -10,6 +10,7 @@ macro_rules! steps {
 
 steps! {
     FEATURES = "features": ["features", "scale space", "pyramid", "corners", "describe"];
+    RANGE = "range": ["range", "features", "scale space", "pyramid", "corners", "describe", "match"];
     MATCH = "match": ["match", "slanted views", "slanted view"];
     GUIDED = "guided": ["guided", "neighbors"];
     POSE = "pose": ["plane", "lens", "pose"];

@@ -50,12 +50,12 @@ fn images_that_are_no_rectified_pair_are_errors() {
         }
     }
     // Exchanged, with the range of feature matches: negative disparities have no depth.
-    let auto = DepthOptions { disparities: DisparityRange::FromMatches { min: None }, ..Default::default() };
+    let auto = DepthOptions { disparities: DisparityRange::Auto { min: None }, ..Default::default() };
     let error = depth(right, left, None, &auto, &Silent).map(|_| ()).unwrap_err();
     assert!(matches!(error, DepthError::NoRange(RangeError::Exchanged { range: (..-8, ..9) })), "{error}");
     // A given negative minimum is accepted.
     let min = exchanged_min(depth(left, right, None, &auto, &Silent).unwrap().disparities);
-    let below = DepthOptions { disparities: DisparityRange::FromMatches { min: Some(min) }, ..Default::default() };
+    let below = DepthOptions { disparities: DisparityRange::Auto { min: Some(min) }, ..Default::default() };
     assert!(depth(right, left, None, &below, &Silent).unwrap().map.matched_fraction() > 0.5);
     // Ten rows lower; then a range beyond the nearest wall.
     let lower = pair.right.image.view().crop(0, 10, 320, 230).unwrap();

@@ -59,7 +59,8 @@ fn frames(seed: u64) -> Vec<Frame> {
 }
 
 fn maps(frames: &[Frame], sequence: bool) -> Vec<DisparityMap> {
-    let options = StereoOptions { disparities: 48, sequence, ..Default::default() };
+    // Not smoothed: that leaves less noise to average.
+    let options = StereoOptions { disparities: 48, sequence, denoise: false, ..Default::default() };
     let mut matcher = StereoMatcher::new(options).unwrap();
     frames.iter().map(|f| matcher.compute(f.images[0].view(), f.images[1].view(), &Silent).unwrap()).collect()
 }

@@ -78,7 +78,7 @@ pub(crate) struct Args {
     /// Width and height of the rectified images, such as 1280x960 [default: as `cv rectify`].
     #[arg(long, value_name = "WxH", value_parser = size, requires = "rig")]
     size: Option<(usize, usize)>,
-    /// Size of the disparity search range in pixels, or auto: from feature matches (for frames, of the first pair).
+    /// Size of the disparity search range in pixels, or auto: from the images at a fraction of their size (for frames, of the first pair).
     #[arg(long, value_name = "N|auto", default_value = "128", value_parser = parse_range)]
     disparities: Range,
     /// Smallest disparity of the search range in pixels; may be negative [default: 0, or from auto].
@@ -182,7 +182,7 @@ impl Run for Args {
             return vec![steps::FRAMES];
         }
         let rectified = (!self.rig.is_empty()).then_some(steps::RECTIFY);
-        let range = [steps::FEATURES, steps::MATCH].into_iter().filter(|_| self.disparities == Range::Auto);
+        let range = (self.disparities == Range::Auto).then_some(steps::RANGE);
         let quality = self.quality.then_some(steps::EXPAND);
         rectified.into_iter().chain(range).chain([steps::DISPARITIES]).chain(quality).chain([steps::DEPTH]).collect()
     }

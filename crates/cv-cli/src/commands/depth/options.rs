@@ -54,7 +54,7 @@ impl Args {
             .with_penalties(self.p1, self.p2),
             disparities: match self.disparities {
                 Range::Number(_) => DisparityRange::Given,
-                Range::Auto => DisparityRange::FromMatches { min: self.min_disparity },
+                Range::Auto => DisparityRange::Auto { min: self.min_disparity },
             },
             range: (self.near, self.far.unwrap_or(f32::INFINITY)),
             few_matches: if self.force { FewMatches::Keep } else { FewMatches::Check },
