@@ -81,29 +81,28 @@ pub(crate) fn image_range<T: Intensity + Pixel, const C: usize>(
     progress: &dyn Progress,
 ) -> Result<(i32, usize), RangeError> {
     let coarse = |right| coarse_range([left, right], min, options, progress);
-    let first = coarse(right)?;
-    let (first, count) = match first {
-        Some(found) if found.matched_fraction >= USUAL_MATCHED_FRACTION => found.with_margin(),
-        _ => match (match_pair(to_rgb8(left).view(), to_rgb8(right).view(), progress), first) {
-            (Err(RangeError::Cancelled(stop)), _) => return Err(stop.into()),
-            (Err(_), Some(first)) => first.with_margin(),
-            (Err(error), None) => return Err(error),
-            (Ok(mut matches), first) => {
-                if left.size() == right.size() {
-                    alignment.update_from_features(&matches, left.size());
-                }
-                // Without memory for it, the matcher has none either.
-                let corrected = alignment.correct(right).ok().flatten();
-                let second = corrected.as_ref().map(|right| coarse(right.view())).transpose()?.flatten();
-                if let Some(offset) = alignment.offset {
-                    offset.correct_matches(&mut matches);
-                }
-                match second.or(first) {
-                    Some(found) => found.with_margin(),
-                    None => range_from_matches(&matches)?,
-                }
+    let (mut found, mut matches) = (coarse(right)?, Vec::new());
+    if found.is_none_or(|found| found.matched_fraction < USUAL_MATCHED_FRACTION) {
+        match match_pair(to_rgb8(left).view(), to_rgb8(right).view(), progress) {
+            Ok(pairs) => matches = pairs,
+            Err(RangeError::Cancelled(stop)) => return Err(stop.into()),
+            Err(error) if found.is_none() => return Err(error),
+            Err(_) => {}
+        }
+        if left.size() == right.size() {
+            alignment.update_from_features(&matches, left.size());
+        }
+        if let Some(offset) = alignment.offset {
+            offset.correct_matches(&mut matches);
+            // Without memory for it, the matcher has none either.
+            if let Some(corrected) = alignment.correct(right).ok().flatten() {
+                found = coarse(corrected.view())?.or(found);
             }
-        },
+        }
+    }
+    let (first, count) = match found {
+        Some(CoarseRange { range, scale, .. }) => with_margin(range, scale as f64),
+        None => range_from_matches(&matches)?,
     };
     let last = i64::from(first) + count as i64 - 1;
     let range = (first, last as i32);
@@ -114,21 +113,11 @@ pub(crate) fn image_range<T: Intensity + Pixel, const C: usize>(
     Ok((min_disparity, (last - i64::from(min_disparity) + 1).max(1) as usize))
 }
 
-/// Minimum fraction of matched and confirmed pixels of a pair at a fraction of its size for its range. With a vertical disparity of 8 px public pairs have up to
-/// 0.42, unrelated ones less than 0.2.
+/// Minimum fraction of matched and confirmed pixels of a pair at a fraction of its size for its range: with a vertical disparity of 8 px public pairs have up to
+/// 0.42.
 const MIN_COARSE_MATCHED: f64 = 0.4;
 /// That of most aligned pairs: public ones have 0.74 to 0.99, but for one with 0.63; with a vertical disparity of 4 px 0.29 to 0.69.
 const USUAL_MATCHED_FRACTION: f64 = 0.7;
-
-/// The range of disparities of matches.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct MatchedRange {
-    /// Smallest and largest disparity in px.
-    range: (f64, f64),
-    /// Minimum margin in px.
-    margin: f64,
-    matched_fraction: f64,
-}
 
 /// Estimates the range of a rectified pair by matching it at a fraction of its size; `None` where little is matched.
 fn coarse_range<T: Intensity, const C: usize>(
@@ -136,15 +125,13 @@ fn coarse_range<T: Intensity, const C: usize>(
     min: Option<i32>,
     options: &StereoOptions,
     progress: &dyn Progress,
-) -> Result<Option<MatchedRange>, Cancelled> {
-    let CoarseRange { range, matched_fraction, scale } = match CoarseRange::estimate(images, min, options, progress) {
-        Ok(Some(coarse)) => coarse,
-        Err(StereoError::Cancelled(stop)) => return Err(stop),
+) -> Result<Option<CoarseRange>, Cancelled> {
+    match CoarseRange::estimate(images, min, options, progress) {
+        Ok(found) => Ok(found.filter(|found| found.matched_fraction >= MIN_COARSE_MATCHED)),
+        Err(StereoError::Cancelled(stop)) => Err(stop),
         // The matcher reports what is wrong with the pair.
-        Ok(None) | Err(_) => return Ok(None),
-    };
-    let is_enough = matched_fraction >= MIN_COARSE_MATCHED;
-    Ok(is_enough.then_some(MatchedRange { range, margin: scale as f64, matched_fraction }))
+        Err(_) => Ok(None),
+    }
 }
 
 /// Matches the features of a pair.
@@ -174,18 +161,14 @@ pub(crate) fn is_exchanged((low, high): (i32, i32)) -> bool {
 /// Returns the extended range of a non-empty list of disparities.
 pub(crate) fn range_with_margin(mut disparities: Vec<f64>) -> (i32, usize) {
     let mut quantile_at = |fraction: f64| quantile(&mut disparities, fraction).unwrap_or(0.0);
-    let range = (quantile_at(0.01), quantile_at(0.99));
-    MatchedRange { range, margin: 4.0, matched_fraction: 1.0 }.with_margin()
+    with_margin((quantile_at(0.01), quantile_at(0.99)), 4.0)
 }
 
-impl MatchedRange {
-    /// Extends the range at both ends by an eighth of it and the minimum margin; returns the first and the number of disparities.
-    fn with_margin(&self) -> (i32, usize) {
-        let (low, high) = self.range;
-        let margin = (high - low) / 8.0 + self.margin;
-        let min = (low - margin).floor() as i32;
-        // Disparities below zero are beyond infinity: a match or two are wrong or rounded.
-        let min = if low > -1.0 { min.max(0) } else { min };
-        (min, ((high + margin).ceil() as i32 - min + 1).max(1) as usize)
-    }
+/// Extends a range at both ends by an eighth of it and `least` px; returns the first and the number of disparities.
+fn with_margin((low, high): (f64, f64), least: f64) -> (i32, usize) {
+    let margin = (high - low) / 8.0 + least;
+    let min = (low - margin).floor() as i32;
+    // Disparities below zero are beyond infinity: a match or two are wrong or rounded.
+    let min = if low > -1.0 { min.max(0) } else { min };
+    (min, ((high + margin).ceil() as i32 - min + 1).max(1) as usize)
 }

@@ -21,7 +21,8 @@ pub(crate) struct Alignment {
     /// Whether estimation has ended: the offset is known, or cannot be determined.
     is_closed: bool,
     attempts: u8,
-    has_tried_features: bool,
+    /// The estimate of features, once it was made: in a film, matching them again would take most of the time.
+    from_features: Option<Option<VerticalOffset>>,
     /// Until estimation has ended, that of features.
     pub(crate) offset: Option<VerticalOffset>,
 }
@@ -35,9 +36,9 @@ impl Alignment {
     /// Uses the offset of feature matches if it is larger than blocks can estimate.
     pub(crate) fn update_from_features(&mut self, matches: &[Correspondence], size: (usize, usize)) {
         if !self.is_closed {
-            self.has_tried_features = true;
             let estimate = estimate_from_features(matches, size);
-            self.offset = estimate.filter(|offset| offset.largest() > MAX_BLOCK_OFFSET && offset.is_to_correct());
+            self.from_features = Some(estimate);
+            self.offset = estimate.filter(|offset| offset.largest() > MAX_BLOCK_OFFSET);
         }
     }
 
@@ -68,17 +69,18 @@ impl Alignment {
                 self.close(from_blocks);
                 return Ok(self.offset.is_some());
             }
-            // Once only: in a film, features would take most of the time.
-            if !self.has_tried_features {
-                self.has_tried_features = true;
-                let [a, b] = [left, right].map(to_rgb8);
-                let from_features = match match_pair(a.view(), b.view(), progress) {
-                    Ok(matches) => estimate_from_features(&matches, left.size()),
-                    Err(RangeError::Cancelled(stop)) => return Err(stop.into()),
-                    Err(_) => None,
-                };
-                self.offset = from_features.filter(VerticalOffset::is_to_correct);
-            }
+            self.offset = match self.from_features {
+                Some(known) => known,
+                None => {
+                    let [a, b] = [left, right].map(to_rgb8);
+                    match match_pair(a.view(), b.view(), progress) {
+                        Ok(matches) => estimate_from_features(&matches, left.size()),
+                        Err(RangeError::Cancelled(stop)) => return Err(stop.into()),
+                        Err(_) => None,
+                    }
+                }
+            };
+            self.from_features = Some(self.offset);
         }
         if let Some(offset) = self.offset {
             let corrected = self.correct(right)?;
@@ -117,7 +119,7 @@ fn estimate_from_blocks<T: Intensity, const C: usize>(
     }
 }
 
-/// Estimates the offset from feature matches.
+/// Estimates the offset from feature matches, if it is to be corrected.
 fn estimate_from_features(matches: &[Correspondence], size: (usize, usize)) -> Option<VerticalOffset> {
-    VerticalOffset::from_correspondences(matches, MIN_FEATURE_INLIER_RATIO, size)
+    VerticalOffset::from_correspondences(matches, MIN_FEATURE_INLIER_RATIO, size).filter(VerticalOffset::is_to_correct)
 }

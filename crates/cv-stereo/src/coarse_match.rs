@@ -83,9 +83,24 @@ fn mean_blocks(image: &GrayF32, scale: usize) -> GrayF32 {
     small
 }
 
+/// As [`smoothed_gray`], both images of a pair.
+pub(crate) fn smoothed_pair<T: Intensity, const C: usize>(
+    [left, right]: [ImageView<'_, T, C>; 2],
+    stage: &Stage<'_>,
+) -> Result<[GrayF32; 2], StereoError> {
+    if left.size() != right.size() {
+        return Err(StereoError::SizeMismatch { left: left.size(), right: right.size() });
+    }
+    let [left, right] = [left, right].map(|image| {
+        let gray = smoothed_gray(image);
+        stage.add(1).map(|()| gray)
+    });
+    Ok([left?, right?])
+}
+
 /// Converts an image to gray levels of 0 to 1, smoothed for the interpolation of blocks: without, bilinear interpolation smooths between
 /// pixels and moves minima there.
-pub(crate) fn smoothed_gray<T: Intensity, const C: usize>(view: ImageView<'_, T, C>) -> GrayF32 {
+fn smoothed_gray<T: Intensity, const C: usize>(view: ImageView<'_, T, C>) -> GrayF32 {
     let mut gray = GrayF32::new(view.width(), view.height(), [0.0]);
     let rows = gray.as_mut_slice().par_chunks_mut(view.width().max(1)).enumerate();
     rows.for_each_init(
@@ -121,15 +136,8 @@ impl CoarseRange {
         options: &StereoOptions,
         progress: &dyn Progress,
     ) -> Result<Option<Self>, StereoError> {
-        if left.size() != right.size() {
-            return Err(StereoError::SizeMismatch { left: left.size(), right: right.size() });
-        }
         let stage = Stage::new(progress, "range", 3)?;
-        let [left_gray, right_gray] = [left, right].map(|image| {
-            let gray = smoothed_gray(image);
-            stage.add(1).map(|()| gray)
-        });
-        let gray = [left_gray?, right_gray?];
+        let gray = smoothed_pair([left, right], &stage)?;
         let [first, last] = SEARCHED.map(|fraction| (fraction * left.width() as f64) as i64);
         let first = min.map_or(first, i64::from);
         let options = StereoOptions {

@@ -208,8 +208,9 @@ pub struct StereoOptions {
     /// (0.5 % of it or more) or along 0.4 of a side (0.1 % or more), with a smooth outline. Their pixels are [`crate::PixelState::NoData`]. Default true. Masks
     /// ([`crate::StereoMatcher::set_masks`]) take precedence.
     pub ignore_black_borders: bool,
-    /// Whether a noisy pair is smoothed before it is matched (a Gaussian of σ 0.75 px): if in both images the noise is a twentieth or more of the
-    /// contrast, as at night. With a noise of 6 levels of 255 in each channel, errors above 2 px fall by a third. Default true.
+    /// Whether a noisy pair is smoothed before it is matched (a Gaussian of σ 0.75 px): if in both images the noise, independent from pixel to pixel, is a
+    /// twentieth or more of the contrast, as at night. With a noise of 8 levels of 255, errors above 2 px of two rendered scenes fall to a sixth.
+    /// Default true.
     pub denoise: bool,
     /// Quality mode: local expansion moves over slanted planes (Taniai et al., PAMI 2018) after semi-global matching. Takes about forty-five times
     /// as long and leaves four fifths of the errors above 2 px (Middlebury 2014, quarter size), on roads half. Default

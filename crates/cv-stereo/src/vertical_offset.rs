@@ -1,6 +1,6 @@
 //! Vertical disparity of a nearly rectified pair as a function of the position, estimated from matches.
 
-use crate::coarse_match::{match_coarsely, smoothed_gray};
+use crate::coarse_match::{match_coarsely, smoothed_pair};
 use crate::vertical_matches::{VerticalMatch, vertical_matches};
 use crate::{Intensity, StereoError, StereoOptions};
 use cv_core::{Correspondence, Image, ImageError, ImageView, Point2, Progress, Stage};
@@ -103,16 +103,9 @@ impl VerticalOffset {
         options: &StereoOptions,
         progress: &dyn Progress,
     ) -> Result<Option<Self>, StereoError> {
-        if left.size() != right.size() {
-            return Err(StereoError::SizeMismatch { left: left.size(), right: right.size() });
-        }
         options.validate()?;
         let stage = Stage::new(progress, "align", 2)?;
-        let [left_gray, right_gray] = [left, right].map(|image| {
-            let gray = smoothed_gray(image);
-            stage.add(1).map(|()| gray)
-        });
-        let gray = [left_gray?, right_gray?];
+        let gray = smoothed_pair([left, right], &stage)?;
         let coarse = match_coarsely(gray.each_ref(), options, (2, MAX_COARSE_COSTS), progress)?;
         let matches = vertical_matches(gray.each_ref(), &coarse);
         Ok(Self::from_matches(&matches, MIN_BLOCK_INLIER_RATIO, left.size()))

@@ -169,7 +169,8 @@ fn outside_estimated_range(folder: &Path) -> Result<Check> {
         // Half a pixel: disparities are refined beyond the last one that is searched.
         let is_outside = |d: &&f32| **d < first as f32 - 0.5 || **d > last as f32 + 0.5;
         let percent = 100.0 * known.iter().filter(is_outside).count() as f64 / known.len().max(1) as f64;
-        println!("{}: range {first} to {last}, {percent:.2} % outside", folder.display());
+        let name = folder.file_name().unwrap_or_default().to_string_lossy();
+        println!("{name}: range {first} to {last}, {percent:.2} % outside");
         worst = worst.max(percent);
     }
     // What is seen by the left camera only may be nearer than all that is matched.

@@ -49,7 +49,7 @@ fn images_that_are_no_rectified_pair_are_errors() {
             _ => assert!(matches!(cause, NoPairCause::Unrelated { .. }), "{i}: {cause:?}"),
         }
     }
-    // Exchanged, with the range of feature matches: negative disparities have no depth.
+    // Exchanged, with the range of the images: negative disparities have no depth.
     let auto = DepthOptions { disparities: DisparityRange::Auto { min: None }, ..Default::default() };
     let error = depth(right, left, None, &auto, &Silent).map(|_| ()).unwrap_err();
     assert!(matches!(error, DepthError::NoRange(RangeError::Exchanged { range: (..-8, ..9) })), "{error}");

@@ -7,7 +7,7 @@ use cv_synth::{RenderOptions, Scene, stereo_pair};
 #[test]
 fn the_range_of_a_generated_room_is_tight() {
     let camera = Camera::from_focal(320, 240, 280.0);
-    // From 3 rooms each, with disparities of 5 to 40 and of 12 to 80 px.
+    // Disparities of 3 to 14 px, and of 8 to 35.
     for (seed, baseline) in (4..7).flat_map(|seed| [(seed, 0.1), (seed, 0.25)]) {
         let scene = Scene::room(seed);
         let pair = stereo_pair(&scene, &camera, &scene.viewpoint(), baseline, &RenderOptions::draft()).unwrap();

@@ -218,7 +218,7 @@ fn a_vertical_disparity_of_several_pixels_is_estimated_from_features_and_blocks(
                 let offset = found.vertical_offset.unwrap();
                 println!("{name}, {rows} rows: {offset:?}");
                 for (x, y) in [(0.0, 0.0), (639.0, 0.0), (0.0, 479.0), (639.0, 479.0)] {
-                    // As below a pixel; features alone are up to a quarter off.
+                    // As below a pixel.
                     assert!((offset.at(x, y) - rows as f64).abs() < 0.1, "{name}, {rows} rows: {offset:?}");
                 }
             }
