@@ -12,7 +12,7 @@ fn done<R: Send>(py: Python<'_>, work: impl FnOnce() -> Result<R, IoError> + Sen
     py.detach(work).map_err(|error| of_file(py, &error))
 }
 
-/// Reads an image at its bit depth, with the EXIF orientation applied: uint8, uint16, or float32 (linear); of shape (height, width), or (height, width, 3) in RGB.
+/// Reads an image at its bit depth, with the EXIF orientation applied: uint8, uint16, or float32 (linear, as of OpenEXR and Radiance files); of shape (height, width), or (height, width, 3) in RGB.
 ///
 /// Raises FileNotFoundError, or FileError with the reason.
 #[pyfunction]
