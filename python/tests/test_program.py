@@ -50,6 +50,15 @@ def test_a_panorama(tmp_path):
     assert np.array_equal(epipole.read_image(tmp_path / "p.png"), epipole.panorama(photographs).image)
 
 
+def test_openexr_files_of_the_program_are_read(tmp_path):
+    photographs = [FIXTURES / "panorama" / f"view{i}.jpg" for i in range(3)]
+    found = run("panorama", *photographs, "-o", tmp_path / "light.exr")
+    radiance = epipole.read_image(tmp_path / "light.exr")
+    assert radiance.dtype == np.float32 and radiance.shape[2] == 3 and np.isfinite(radiance).all()
+    # A room in daylight: not black, and no more than some times the exposure of its photographs.
+    assert 0.05 < np.median(radiance) < 2.0, found
+
+
 def test_two_views(tmp_path):
     photographs = [FIXTURES / "two-view" / f"{name}.jpg" for name in "ab"]
     focal = json.loads((FIXTURES / "oracle" / "two-view.json").read_text())["focal_px"]

@@ -1,7 +1,12 @@
 //! Verification of image pairs by a homography: rotating cameras or planar scenes (Brown & Lowe 2007, §3.2).
 
+use crate::homography::{RadialHomography, estimate_radial_homography};
 use crate::{EstimateError, RobustOptions, estimate_homography};
-use cv_core::{Correspondence, Matrix3, Point2, Silent, Vector3};
+use cv_core::{Correspondence, Matrix3, Point2, Silent};
+
+/// Minimum ratio of the inliers with distortion to those without, at which images are taken as distorted: parallax of a
+/// hand-held camera can gain a quarter, lenses whose panoramas fail without distortion gain a half.
+const MIN_DISTORTED_RATIO: f64 = 1.35;
 
 /// Options of [`verify_pair`].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -31,8 +36,12 @@ pub struct VerifiedPair {
     pub a: usize,
     /// Index of the second image.
     pub b: usize,
-    /// Maps pixels of `a` to pixels of `b`.
+    /// Maps pixels of `a` to pixels of `b`, both undistorted by `distortion`.
     pub homography: Matrix3<f64>,
+    /// Coefficient λ of radial distortion by the division model: an undistorted pixel is `c + d / (1 + λ r²)` for a pixel
+    /// `c + d`, with c the image center and r = |d| relative to half the diagonal; negative for barrel distortion. 0 where the
+    /// matches agree without.
+    pub distortion: f64,
     /// Indices of the tentative matches that are inliers of the homography, ascending.
     pub inliers: Vec<usize>,
     /// The inliers, in pixels.
@@ -68,8 +77,8 @@ pub enum PairRejection {
 
 /// Verifies that two images overlap, from their tentative matches.
 ///
-/// Estimates a homography with RANSAC and accepts the pair if the number of inliers exceeds `alpha + beta · (matches in
-/// the overlap)`. `a` and `b` are each an index and a size (width, height) in pixels.
+/// Estimates a homography with RANSAC, and radial distortion where it explains significantly more matches, and accepts the
+/// pair if the number of inliers exceeds `alpha + beta · (matches in the overlap)`. `a` and `b` are each an index and a size (width, height) in pixels.
 ///
 /// # Errors
 /// [`PairRejection`].
@@ -81,28 +90,32 @@ pub fn verify_pair(
 ) -> Result<VerifiedPair, PairRejection> {
     let robust = RobustOptions { threshold: options.threshold, seed: options.seed, ..RobustOptions::homography() };
     let estimate = estimate_homography(matches, &robust, &Silent)?;
-    let h = estimate.model;
-    let Some(inverse) = h.try_inverse() else { return Err(PairRejection::ImplausibleHomography) };
-    let is_in_image = |m: &Matrix3<f64>, p: Point2<f64>, (w, height): (usize, usize)| {
-        let q = m * Vector3::new(p.x, p.y, 1.0);
-        let (x, y) = (q.x / q.z, q.y / q.z);
-        q.z > 0.0 && x >= 0.0 && y >= 0.0 && x <= w as f64 && y <= height as f64
-    };
-    // H[2][2] = 1, so the denominator is positive in front of the camera; the sign of the inverse is chosen
-    // accordingly.
-    let inverse = if inverse[(2, 2)] < 0.0 { -inverse } else { inverse };
-    let in_overlap =
-        matches.iter().filter(|c| is_in_image(&h, c.a, size_b) && is_in_image(&inverse, c.b, size_a)).count();
-    let inliers = estimate.inliers.len();
-    let needed = options.alpha + options.beta * in_overlap as f64;
-    if inliers as f64 <= needed {
-        return Err(PairRejection::TooFewInliers { inliers, in_overlap, needed });
+    let sizes = [size_a, size_b];
+    let mut model = RadialHomography::new(estimate.model, sizes, 0.0).ok_or(PairRejection::ImplausibleHomography)?;
+    let mut inliers = estimate.inliers;
+    if let Some((distorted, more)) = estimate_radial_homography(matches, sizes, &inliers, options.threshold)
+        && more.len() as f64 > MIN_DISTORTED_RATIO * inliers.len() as f64
+    {
+        (model, inliers) = (distorted, more);
     }
-    let inlier_matches: Vec<Correspondence> = estimate.inliers.iter().map(|&i| matches[i]).collect();
+    let is_in_image = |p: Option<Point2<f64>>, (w, height): (usize, usize)| {
+        p.is_some_and(|p| p.x >= 0.0 && p.y >= 0.0 && p.x <= w as f64 && p.y <= height as f64)
+    };
+    let in_overlap = matches
+        .iter()
+        .filter(|c| is_in_image(model.transfer(c.a), size_b) && is_in_image(model.transfer_back(c.b), size_a))
+        .count();
+    let needed = options.alpha + options.beta * in_overlap as f64;
+    if inliers.len() as f64 <= needed {
+        return Err(PairRejection::TooFewInliers { inliers: inliers.len(), in_overlap, needed });
+    }
+    let inlier_matches: Vec<Correspondence> = inliers.iter().map(|&i| matches[i]).collect();
     // The Jacobian determinant at each inlier: the local change of area, positive where the orientation is preserved.
-    let jacobian = |c: &Correspondence| h.determinant() / (h * Vector3::new(c.a.x, c.a.y, 1.0)).z.powi(3);
+    let h = model.matrix;
+    let jacobian =
+        |c: &Correspondence| h.determinant() / (h * model.lenses[0].undistort(c.a).to_homogeneous()).z.powi(3);
     if !inlier_matches.iter().all(|c| (1.0 / 64.0..64.0).contains(&jacobian(c))) {
         return Err(PairRejection::ImplausibleHomography);
     }
-    Ok(VerifiedPair { a, b, homography: h, inliers: estimate.inliers, matches: inlier_matches })
+    Ok(VerifiedPair { a, b, homography: h, distortion: model.coefficient, inliers, matches: inlier_matches })
 }

@@ -37,7 +37,7 @@ fn pair(a: usize, b: usize, views: &[View]) -> Option<VerifiedPair> {
         * views[a].from_world.try_inverse()?
         * views[a].camera.matrix().try_inverse()?;
     let inliers = (0..matches.len()).collect();
-    (matches.len() > 20).then(|| VerifiedPair { a, b, homography: h / h[(2, 2)], inliers, matches })
+    (matches.len() > 20).then(|| VerifiedPair { a, b, homography: h / h[(2, 2)], distortion: 0.0, inliers, matches })
 }
 
 fn pairs(views: &[View]) -> Vec<VerifiedPair> {

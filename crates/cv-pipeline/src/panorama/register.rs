@@ -411,7 +411,7 @@ mod tests {
     fn verified(a: usize, b: usize, agree: usize) -> MatchedPair {
         let pair = PanoramaPair { a, b, matches: Vec::new(), inliers: Vec::new(), rejected: None };
         let (inliers, matches) = ((0..agree).collect(), vec![Correspondence::new(0.0, 0.0, 0.0, 0.0); agree]);
-        (pair, Some(VerifiedPair { a, b, homography: Matrix3::identity(), inliers, matches }))
+        (pair, Some(VerifiedPair { a, b, homography: Matrix3::identity(), distortion: 0.0, inliers, matches }))
     }
 
     #[test]
