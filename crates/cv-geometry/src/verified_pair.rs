@@ -1,11 +1,11 @@
 //! Verification of image pairs by a homography: rotating cameras or planar scenes (Brown & Lowe 2007, §3.2).
 
-use crate::homography::{RadialHomography, estimate_radial_homography};
+use crate::homography::{Division, RadialHomography, estimate_radial_homography};
 use crate::{EstimateError, RobustOptions, estimate_homography};
 use cv_core::{Correspondence, Matrix3, Point2, Silent};
 
 /// Minimum ratio of the inliers with distortion to those without, at which images are taken as distorted: parallax of a
-/// hand-held camera can gain a quarter, lenses whose panoramas fail without distortion gain a half.
+/// hand-held camera can gain a quarter, lenses whose panoramas fail without distortion gain two fifths at least.
 const MIN_DISTORTED_RATIO: f64 = 1.35;
 
 /// Options of [`verify_pair`].
@@ -78,7 +78,8 @@ pub enum PairRejection {
 /// Verifies that two images overlap, from their tentative matches.
 ///
 /// Estimates a homography with RANSAC, and radial distortion where it explains significantly more matches, and accepts the
-/// pair if the number of inliers exceeds `alpha + beta · (matches in the overlap)`. `a` and `b` are each an index and a size (width, height) in pixels.
+/// pair if the number of inliers exceeds `alpha + beta · (matches in the overlap)`. `a` and `b` are each an index and a
+/// size (width, height) in pixels.
 ///
 /// # Errors
 /// [`PairRejection`].
@@ -91,7 +92,8 @@ pub fn verify_pair(
     let robust = RobustOptions { threshold: options.threshold, seed: options.seed, ..RobustOptions::homography() };
     let estimate = estimate_homography(matches, &robust, &Silent)?;
     let sizes = [size_a, size_b];
-    let mut model = RadialHomography::new(estimate.model, sizes, 0.0).ok_or(PairRejection::ImplausibleHomography)?;
+    let mut model = RadialHomography::new(estimate.model, sizes.map(|size| Division::new(size, 0.0)))
+        .ok_or(PairRejection::ImplausibleHomography)?;
     let mut inliers = estimate.inliers;
     if let Some((distorted, more)) = estimate_radial_homography(matches, sizes, &inliers, options.threshold)
         && more.len() as f64 > MIN_DISTORTED_RATIO * inliers.len() as f64
@@ -117,5 +119,5 @@ pub fn verify_pair(
     if !inlier_matches.iter().all(|c| (1.0 / 64.0..64.0).contains(&jacobian(c))) {
         return Err(PairRejection::ImplausibleHomography);
     }
-    Ok(VerifiedPair { a, b, homography: h, distortion: model.coefficient, inliers, matches: inlier_matches })
+    Ok(VerifiedPair { a, b, homography: h, distortion: model.lenses[0].coefficient, inliers, matches: inlier_matches })
 }

@@ -7,7 +7,7 @@ mod refine;
 
 pub use dlt::homography_from_points;
 pub use four_point::homography_four_point;
-pub(crate) use radial::{RadialHomography, estimate_radial_homography};
+pub(crate) use radial::{Division, RadialHomography, estimate_radial_homography};
 
 use crate::error::EstimateError;
 use crate::match_blocks::{LANES, MatchBlock, NormalizedMatches, PairBlocks, point_degeneracy};

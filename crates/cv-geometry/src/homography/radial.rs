@@ -6,7 +6,7 @@ use cv_core::{Correspondence, Matrix3, Point2, Vector2};
 
 /// Coefficients that are tried: strong barrel distortion, of action cameras, to strong pincushion distortion.
 const COEFFICIENTS: std::ops::RangeInclusive<f64> = -0.6..=0.3;
-/// Their spacing. Half of it is negligible: at the corners of an overlap, about the threshold of inliers.
+/// Their spacing; the best one is refined to a quarter of it.
 const SPACING: f64 = 0.05;
 /// Thresholds of the local optimization, relative to the final one: the first inliers are those of a homography of a part of the images.
 const THRESHOLDS: [f64; 5] = [4.0, 3.0, 2.0, 1.0, 1.0];
@@ -17,7 +17,8 @@ const THRESHOLDS: [f64; 5] = [4.0, 3.0, 2.0, 1.0, 1.0];
 pub(crate) struct Division {
     center: Vector2<f64>,
     half_diagonal: f64,
-    coefficient: f64,
+    /// λ.
+    pub(crate) coefficient: f64,
 }
 
 impl Division {
@@ -49,21 +50,20 @@ impl Division {
 /// A homography between undistorted pixels.
 #[derive(Debug, Clone)]
 pub(crate) struct RadialHomography {
-    /// The distortions of the two images.
+    /// The distortions of the two images, with the same coefficient.
     pub(crate) lenses: [Division; 2],
     /// Maps undistorted pixels of the first image to those of the second.
     pub(crate) matrix: Matrix3<f64>,
     inverse: Matrix3<f64>,
-    pub(crate) coefficient: f64,
 }
 
 impl RadialHomography {
     /// `None` if the matrix is singular.
-    pub(crate) fn new(matrix: Matrix3<f64>, sizes: [(usize, usize); 2], coefficient: f64) -> Option<Self> {
+    pub(crate) fn new(matrix: Matrix3<f64>, lenses: [Division; 2]) -> Option<Self> {
         let inverse = matrix.try_inverse()?;
         // H[2][2] = 1, so the denominator is positive in front of the camera; the sign of the inverse is chosen accordingly.
         let inverse = if inverse[(2, 2)] < 0.0 { -inverse } else { inverse };
-        Some(Self { lenses: sizes.map(|size| Division::new(size, coefficient)), matrix, inverse, coefficient })
+        Some(Self { lenses, matrix, inverse })
     }
 
     /// Maps a pixel of the first image to the second; `None` behind the camera.
@@ -109,15 +109,15 @@ pub(crate) fn estimate_radial_homography(
     threshold: f64,
 ) -> Option<Found> {
     let fit = |coefficient: f64| -> Option<Found> {
-        let [first, second] = sizes.map(|size| Division::new(size, coefficient));
+        let lenses = sizes.map(|size| Division::new(size, coefficient));
         let mut inliers = start.to_vec();
         let mut model = None;
         for ratio in THRESHOLDS {
             let undistorted: Vec<Correspondence> = inliers
                 .iter()
-                .map(|&i| Correspondence { a: first.undistort(matches[i].a), b: second.undistort(matches[i].b) })
+                .map(|&i| Correspondence { a: lenses[0].undistort(matches[i].a), b: lenses[1].undistort(matches[i].b) })
                 .collect();
-            let found = RadialHomography::new(homography_from_points(&undistorted).ok()?, sizes, coefficient)?;
+            let found = RadialHomography::new(homography_from_points(&undistorted).ok()?, lenses)?;
             inliers = found.inliers(matches, ratio * threshold);
             model = Some(found);
         }
@@ -138,7 +138,7 @@ pub(crate) fn estimate_radial_homography(
         }
     }
     for step in [0.5 * SPACING, 0.25 * SPACING] {
-        let center = best.as_ref()?.0.coefficient;
+        let center = best.as_ref()?.0.lenses[0].coefficient;
         for coefficient in [center - step, center + step] {
             let found = fit(coefficient);
             if count(&found) > count(&best) {

@@ -104,7 +104,7 @@ impl<'a> Group<'a> {
         (of, representatives)
     }
 
-    /// Returns the homography of an edge from member `from`, in pixels relative to the principal points.
+    /// Returns the homography of an edge from member `from`, in (undistorted) pixels relative to the principal points.
     fn homography(&self, edge: usize, from: usize) -> Matrix3<f64> {
         let (pair, e) = (self.pairs[edge], self.graph.edges()[edge]);
         let shift = |v: Vector2<f64>| Matrix3::new(1.0, 0.0, v.x, 0.0, 1.0, v.y, 0.0, 0.0, 1.0);

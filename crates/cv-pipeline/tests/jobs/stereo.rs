@@ -211,9 +211,8 @@ fn a_vertical_disparity_of_several_pixels_is_estimated_from_features_and_blocks(
         for rows in [-4_i64, 3, 7] {
             let moved =
                 RgbU8::from_fn(640, 480, |x, y| pair.right.image.at(x, (y as i64 - rows).clamp(0, 479) as usize));
-            // The range is found before the offset, once for all rows of a scene.
             let search = [DisparityRange::Given, DisparityRange::Auto { min: None }];
-            for disparities in search.into_iter().take(if rows == 3 { 2 } else { 1 }) {
+            for disparities in search {
                 let options = DepthOptions { stereo: stereo.clone(), disparities, ..DepthOptions::default() };
                 let found = depth(pair.left.image.view(), moved.view(), None, &options, &Silent).unwrap();
                 let offset = found.vertical_offset.unwrap();
