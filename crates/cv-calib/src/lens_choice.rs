@@ -1,12 +1,12 @@
 //! Selection of the lens model of one camera by cross-validation.
 
-use crate::adjustment::{Failure, check_adjustable};
+use crate::adjustment::{Estimate, Failure, InlierMask, check_adjustable};
 use crate::fit::{Fit, Limits, fit};
 use crate::holdout::{HoldOut, hold_out};
 use crate::start::{InitialValues, estimate_initial_values, mask_of_views, poses_from_homographies};
 use crate::target::TargetObservations;
 use crate::{CalibrateError, LensChoice};
-use cv_core::{Cancelled, Distortion, DistortionModel, LensProjection, Progress, Stage};
+use cv_core::{Cancelled, Distortion, DistortionModel, LensProjection, Point2, Progress, Stage};
 
 /// Outcome of a lens model.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -81,16 +81,51 @@ pub(crate) fn rms(data: &TargetObservations, fit: &Fit, camera: Option<usize>) -
     ((squares / count.max(1) as f64).sqrt(), count)
 }
 
-/// Returns whether the distortion is monotonic up to the outermost inlier corner.
-fn is_monotonic(data: &TargetObservations, fit: &Fit) -> bool {
+/// Maximum fraction of the corners beyond the monotonic range of the distortion that are rejected as outliers.
+const MAX_BEYOND_RANGE: f64 = 0.01;
+
+/// Fits a model as [`fit`]. Inlier corners beyond the monotonic range of the distortion are rejected, once: numerator and
+/// denominator of a rational model may have almost the same root, just at the outermost corner. `None` if the distortion is
+/// not monotonic up to the outermost inlier corner.
+fn fit_monotonic(
+    data: &TargetObservations,
+    start: &Estimate,
+    corners: &InlierMask,
+    limits: Limits,
+    progress: &dyn Progress,
+) -> Result<Option<Fit>, Failure> {
+    let mut usable = corners.clone();
+    let first = fit(data, start, &usable, limits, progress)?;
+    let beyond = corners_beyond_range(data, &first);
+    if beyond.is_empty() {
+        return Ok(Some(first));
+    }
+    let inliers = first.used.iter().flatten().flatten().filter(|used| **used).count();
+    if beyond.len() as f64 > MAX_BEYOND_RANGE * inliers as f64 {
+        return Ok(None);
+    }
+    for (v, i) in beyond {
+        usable[v][0][i] = false;
+    }
+    let second = fit(data, start, &usable, limits, progress)?;
+    Ok(corners_beyond_range(data, &second).is_empty().then_some(second))
+}
+
+/// Returns the inlier corners at which the distortion is not monotonic: view, index.
+fn corners_beyond_range(data: &TargetObservations, fit: &Fit) -> Vec<(usize, usize)> {
     let camera = &fit.estimate.cameras[0];
-    (0..data.views.len()).all(|v| {
-        let Some(pose) = fit.estimate.poses[v] else { return true };
-        data.views[v][0].iter().zip(&fit.used[v][0]).filter(|(_, used)| **used).all(|(c, _)| {
+    let mut beyond = Vec::new();
+    for (v, pose) in fit.estimate.poses.iter().enumerate() {
+        let Some(pose) = pose else { continue };
+        for (i, (c, used)) in data.views[v][0].iter().zip(&fit.used[v][0]).enumerate() {
             let p = pose.transform(&data.target.bent(c.point, fit.estimate.shape));
-            p.z > 0.0 && camera.distortion.distort_in_range(cv_core::Point2::new(p.x / p.z, p.y / p.z)).is_some()
-        })
-    })
+            let in_range = || camera.distortion.distort_in_range(Point2::new(p.x / p.z, p.y / p.z)).is_some();
+            if *used && !(p.z > 0.0 && in_range()) {
+                beyond.push((v, i));
+            }
+        }
+    }
+    beyond
 }
 
 /// Padé approximant of `atan(r)/r` with two terms in numerator and denominator: an equidistant fisheye as a rational
@@ -177,8 +212,13 @@ pub(crate) fn choose_lens(
             verdict: LensVerdict::Undetermined,
         };
         let fitted = match starts.with_model(model, &stage) {
-            Ok(start) => match fit(data, &start.estimate, &corners, limits, &stage) {
-                Ok(fitted) => Some(fitted),
+            Ok(start) => match fit_monotonic(data, &start.estimate, &corners, limits, &stage) {
+                Ok(Some(fitted)) => Some(fitted),
+                Ok(None) => {
+                    trials.push(LensTrial { verdict: LensVerdict::Folds, ..no_fit });
+                    stage.add(1)?;
+                    continue;
+                }
                 Err(Failure::Cancelled) => return Err(Cancelled.into()),
                 Err(Failure::Adjust(_)) => None,
             },
@@ -197,9 +237,8 @@ pub(crate) fn choose_lens(
         };
         let (rms_px, count) = rms(data, &fitted, None);
         let outliers = corners.iter().flatten().flatten().filter(|u| **u).count() - count;
-        let verdict = if is_monotonic(data, &fitted) { LensVerdict::Asked } else { LensVerdict::Folds };
-        trials.push(LensTrial { rms_px, outliers, verdict, ..no_fit });
-        if verdict == LensVerdict::Asked && count > 0 {
+        trials.push(LensTrial { rms_px, outliers, verdict: LensVerdict::Asked, ..no_fit });
+        if count > 0 {
             fits.push((trials.len() - 1, fitted));
         }
     }
@@ -234,10 +273,15 @@ pub(crate) fn choose_lens(
     Ok(Mono { fit, trials, holdout })
 }
 
+/// Ratio of the hold-out errors up to which more parameters are not worth it: where no board was seen, as in the corners of
+/// the image, they are hardly determined.
+const EQUAL_HOLDOUT_RATIO: f64 = 1.05;
+
 /// Selects the model with the fewest parameters among those whose hold-out error is not significantly larger than the
-/// smallest one. Without held-out views the first model.
+/// smallest one, the first of several. Without held-out views the first model.
 ///
-/// Not significant: the sum of the differences of the views' squared errors is below its standard deviation.
+/// Not significant: the error is up to a twentieth larger, or the sum of the differences of the views' squared errors is below
+/// its standard deviation.
 fn select_model(errors: &[(usize, HoldOut)], fits: &[(usize, Fit)], trials: &mut [LensTrial]) -> usize {
     let parameters = |i: usize| model_of_fit(fits, i).parameter_count();
     let best = errors.iter().min_by(|a, b| a.1.rms(None).total_cmp(&b.1.rms(None)));
@@ -254,14 +298,10 @@ fn select_model(errors: &[(usize, HoldOut)], fits: &[(usize, Fit)], trials: &mut
         let n = differences.len() as f64;
         let mean = differences.iter().sum::<f64>() / n;
         let variance = differences.iter().map(|d| (d - mean) * (d - mean)).sum::<f64>() / (n - 1.0).max(1.0);
-        mean * n <= (variance * n).sqrt()
+        mean * n <= (variance * n).sqrt() || error.rms(None) <= EQUAL_HOLDOUT_RATIO * smallest.rms(None)
     };
-    let mut selected = best;
-    for (i, error) in errors {
-        if is_as_accurate(error) && parameters(*i) < parameters(selected) {
-            selected = *i;
-        }
-    }
+    let accurate = errors.iter().filter(|(_, error)| is_as_accurate(error)).map(|(i, _)| *i);
+    let selected = accurate.min_by_key(|i| parameters(*i)).unwrap_or(best);
     for (i, error) in errors {
         let verdict = if *i == selected {
             LensVerdict::Chosen

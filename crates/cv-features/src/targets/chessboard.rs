@@ -2,7 +2,7 @@
 
 use super::board::{BoardPoint, BoardSize};
 use super::board_error::BoardError;
-use super::grid::{Grid, assemble_grids};
+use super::grid::{Grid, Node, assemble_grids};
 use super::saddle::refine_saddle;
 use super::x_corner::detect_x_corners;
 use crate::error::check_image;
@@ -12,6 +12,13 @@ use cv_parallel::prelude::*;
 /// Window radius of the corner refinement relative to the distance to the nearest neighbor: small enough to exclude the
 /// neighbor's edges.
 const WINDOW_RATIO: f64 = 0.3;
+
+/// Maximum distance in pixels of two detections of one corner.
+const SAME_CORNER: f64 = 3.0;
+
+/// Minimum extent in the image of another board, relative to that of the largest. A smaller one is its picture on the screen
+/// of the computer that records the photographs.
+const MIN_RELATIVE_EXTENT: f64 = 1.0 / 3.0;
 
 /// Options of the board detectors.
 #[derive(Debug, Clone, PartialEq)]
@@ -75,7 +82,7 @@ impl Chessboard {
 /// Detects the chessboard of `size` inner corners, or with `None` the largest one of any size.
 ///
 /// `view` is gray, 0 to 1. Without a size, the visible part of a truncated board counts as a board: use the most
-/// frequent size of several images. A board of 9×6 is also detected as 6×9, with rows and columns exchanged.
+/// frequent size of several images. A second board of less than a third of the first one's extent is ignored. A board of 9×6 is also detected as 6×9, with rows and columns exchanged.
 ///
 /// # Errors
 /// [`BoardError`].
@@ -92,7 +99,6 @@ pub fn find_chessboard(
     check_image(view, 16)?;
     let (corners, smooth) = detect_x_corners(view, options.min_contrast, progress)?;
     let stage = Stage::new(progress, "grid", 0)?;
-    let none = BoardError::NoBoard { corners: corners.len() };
     let mut boards = Vec::new();
     // The reason of the rejection of the largest grid.
     let mut rejection: Option<(usize, BoardError)> = None;
@@ -103,29 +109,53 @@ pub fn find_chessboard(
         } else if rejection.is_some() {
             continue;
         }
-        let seen = largest_full_rectangle(&grid);
-        let Some(part) = seen.filter(|part| part.size().is_valid()) else { continue };
+        // Parts of one board grow to the same one.
+        let is_near = |node: &Node| {
+            let position = node.corner.position;
+            boards.iter().flat_map(|board: &Chessboard| &board.corners).any(|c| (c - position).norm() < SAME_CORNER)
+        };
+        if grid.nodes.values().any(is_near) {
+            continue;
+        }
+        let Some(mut part) = largest_full_rectangle(&grid) else { continue };
         let is_complete = part.size().corners() == grid.nodes.len();
-        let has_size = |asked: BoardSize| [asked, asked.transposed()].contains(&part.size());
-        match size {
-            Some(asked) if has_size(asked) && is_complete => boards.extend(order_corners(&grid, part, asked)),
-            None if is_complete && boards.is_empty() => {
-                boards.extend(order_corners(&grid, part, part.size().landscape()))
-            }
-            _ => {
-                let detected = grid.nodes.len();
-                if rejection.is_none_or(|r| r.0 < detected) {
-                    rejection = Some((detected, rejection_reason(&grid, part, size, view.size())));
+        let board_size = match size {
+            Some(asked) => Some(asked).filter(|a| [*a, a.transposed()].contains(&part.size())),
+            None => Some(part.size().landscape()).filter(|size| size.is_valid() && boards.is_empty()),
+        };
+        let ordered = board_size.filter(|_| is_complete).and_then(|size| order_corners(&grid, part, size));
+        if let Some((size, places)) = ordered {
+            stage.check()?;
+            match localize_corners(smooth.view(), size, &places, options.max_window_radius) {
+                Ok(board) => {
+                    boards.push(board);
+                    continue;
+                }
+                Err(lost) => {
+                    grid.nodes.retain(|_, node| !lost.contains(&node.corner.position));
+                    let Some(left) = largest_full_rectangle(&grid) else { continue };
+                    part = left;
                 }
             }
         }
+        let detected = grid.nodes.len();
+        if part.size().is_valid() && rejection.is_none_or(|r| r.0 < detected) {
+            rejection = Some((detected, rejection_reason(&grid, part, size, view.size())));
+        }
     }
+    let largest = boards.iter().map(extent).fold(0.0, f64::max);
+    boards.retain(|board| extent(board) > MIN_RELATIVE_EXTENT * largest);
     if boards.len() > 1 {
         return Err(BoardError::SeveralBoards { boards: boards.len() });
     }
-    let Some((size, places)) = boards.pop() else { return Err(rejection.map_or(none, |r| r.1)) };
-    stage.check()?;
-    localize_corners(smooth.view(), size, &places, options.max_window_radius).ok_or(none)
+    boards.pop().ok_or_else(|| rejection.map_or(BoardError::NoBoard { corners: corners.len() }, |r| r.1))
+}
+
+/// Returns the diagonal of a board's bounding box in the image, in pixels.
+fn extent(board: &Chessboard) -> f64 {
+    let first = board.corners[0];
+    let (low, high) = board.corners.iter().fold((first, first), |(low, high), c| (low.inf(c), high.sup(c)));
+    (high - low).norm()
 }
 
 /// The position of a corner before the final refinement, and the distance to its nearest neighbor.
@@ -291,13 +321,16 @@ fn order_corners(grid: &Grid, part: Part, size: BoardSize) -> Option<(BoardSize,
 }
 
 /// Refines all corners to sub-pixel accuracy.
+///
+/// # Errors
+/// The positions of the corners at which it fails.
 fn localize_corners(
     view: ImageView<'_, f32, 1>,
     size: BoardSize,
     places: &[Place],
     max_window_radius: f32,
-) -> Option<Chessboard> {
-    let localized = places
+) -> Result<Chessboard, Vec<Point2<f64>>> {
+    let localized: Vec<Option<(Point2<f64>, f64)>> = places
         .par_iter()
         .with_min_len(16)
         .map(|&(start, spacing)| {
@@ -308,6 +341,11 @@ fn localize_corners(
             is_near.then_some((saddle.position, saddle.deviation_unsmoothed()))
         })
         .collect();
-    let (corners, deviations) = localized.into_iter().collect::<Option<Vec<_>>>()?.into_iter().unzip();
-    Some(Chessboard { size, corners, deviations })
+    let lost: Vec<Point2<f64>> =
+        places.iter().zip(&localized).filter(|(_, found)| found.is_none()).map(|((start, _), _)| *start).collect();
+    if !lost.is_empty() {
+        return Err(lost);
+    }
+    let (corners, deviations) = localized.into_iter().flatten().unzip();
+    Ok(Chessboard { size, corners, deviations })
 }

@@ -6,7 +6,7 @@
 //! al., "Automatic camera and range sensor calibration using a single shot", ICRA 2012, grow their boards this way, row
 //! by row).
 
-use super::saddle::refine_saddle;
+use super::saddle::{border_distance, refine_saddle};
 use super::x_corner::{XCorner, edge_directions};
 use cv_core::{Cancelled, ImageView, Point2, Stage, Vector2};
 use cv_imgproc::sample_bilinear;
@@ -120,7 +120,9 @@ fn is_edge(
 ) -> bool {
     let along = to - from;
     let length = along.norm();
-    let across = Vector2::new(-along.y, along.x) / length * (0.5 * clearance * length).clamp(1.5, 12.0);
+    let inside = border_distance(view.size(), from).min(border_distance(view.size(), to));
+    let offset = (0.5 * clearance * length).clamp(1.5, 12.0).min(inside.max(1.5));
+    let across = Vector2::new(-along.y, along.x) / length * offset;
     let sign = if clockwise { 1.0 } else { -1.0 };
     let (mut sum, mut n) = (0.0f32, 0);
     for t in [0.3, 0.4, 0.5, 0.6, 0.7] {
@@ -287,9 +289,13 @@ pub(crate) fn assemble_grids(
     Ok(out)
 }
 
-/// Estimates the two edge directions and the contrast at a position, on a circle with a radius of 2 to 10 pixels.
+/// Estimates the two edge directions and the contrast at a position, on a circle with a radius of 2 to 10 pixels, less
+/// at the image border.
 fn x_corner_at(view: ImageView<'_, f32, 1>, at: Point2<f64>, radius: f64) -> Option<([f64; 2], f32)> {
-    let radius = radius.clamp(2.0, 10.0);
+    let radius = radius.clamp(2.0, 10.0).min(border_distance(view.size(), at));
+    if radius < 2.0 {
+        return None;
+    }
     let angle = |i: usize| i as f64 * (TAU / 16.0);
     let mut values = [0.0f32; 16];
     for (i, v) in values.iter_mut().enumerate() {

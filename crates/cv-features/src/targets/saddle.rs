@@ -1,13 +1,16 @@
-//! Sub-pixel refinement of corners by the Förstner operator.
+//! Sub-pixel refinement of corners by their symmetry.
 //!
-//! Source: W. Förstner & E. Gülch, "A fast operator for detection and precise location of distinct points, corners and
-//! centres of circular features", ISPRS intercommission workshop 1987. The gradient g at every pixel x of a window is
-//! orthogonal to its edge, which passes through the corner p: gᵀ(p − x) = 0. p is the weighted least-squares solution;
-//! the window is recentered until convergence. Straight edges are invariant under perspective, and monotonic intensity
-//! transforms do not move them, so neither tilt nor the camera's tone curve causes a bias.
+//! Where two black and two white squares meet, an image is symmetric under a rotation by 180° about the corner: I(c + d) =
+//! I(c − d). The position c minimizes the weighted squares of the differences over a window (Gauss–Newton). Perspective,
+//! symmetric blur, and the camera's tone curve preserve the symmetry, so none of them causes a bias, and the variance is the
+//! Cramér–Rao bound of a known corner. The equations are those of template matching (Gruen, "Adaptive least squares
+//! correlation", 1985) with the rotated window as the template.
+//!
+//! The Förstner operator (the intersection of the edges' tangents, iterated), which OpenCV's `cornerSubPix` uses as well, has
+//! twice the error on rendered boards, and converges to wrong positions if the blur is as wide as the window.
 
 use crate::simd;
-use cv_core::{ImageView, Point2};
+use cv_core::{ImageView, Point2, Vector2};
 use fearless_simd::{Level, dispatch, f32x8, prelude::*};
 
 /// A refined corner.
@@ -30,13 +33,23 @@ impl Saddle {
 /// Maximum number of iterations.
 const MAX_ITERATIONS: usize = 30;
 
+/// Maximum step of an iteration in pixels: about the width of a sharp edge, within which the equations hold.
+const MAX_STEP: f64 = 1.0;
+
+/// Minimum radius of a window in pixels.
+const MIN_RADIUS: usize = 2;
+
 /// Number of samples that are processed at once.
 const LANES: usize = 8;
 
-/// A window of interpolated intensities around a position: `side` × `side` samples with a spacing of a pixel, in rows
-/// of `stride` values of which the last are zero: [`LANES`] at a time, up to two past each sample.
+/// A window of interpolated intensities around a position, `side` × `side` samples with a spacing of a pixel, as the sum of
+/// an even and an odd part under the rotation by 180°. Rows have `stride` values of which the last are zero: [`LANES`] at a
+/// time, up to two past each sample.
+#[derive(Default)]
 struct Patch {
     values: Vec<f32>,
+    even: Vec<f32>,
+    odd: Vec<f32>,
     side: usize,
     stride: usize,
 }
@@ -46,83 +59,96 @@ impl Patch {
     fn sample(&mut self, view: ImageView<'_, f32, 1>, at: Point2<f64>, radius: usize) -> Option<()> {
         let (w, h) = view.size();
         let (x0, y0) = (at.x - radius as f64, at.y - radius as f64);
-        self.side = 2 * radius + 1;
+        let side = 2 * radius + 1;
         let (bx, by) = (x0.floor(), y0.floor());
         if bx < 0.0 || by < 0.0 || !(bx + by).is_finite() {
             return None;
         }
         let (ix, iy) = (bx as usize, by as usize);
-        if ix + self.side >= w || iy + self.side >= h {
+        if ix + side >= w || iy + side >= h {
             return None;
         }
         let (fx, fy) = ((x0 - bx) as f32, (y0 - by) as f32);
-        self.stride = self.side.next_multiple_of(LANES) + 2;
-        self.values.resize(self.side * self.stride, 0.0);
-        for (j, row) in self.values.chunks_exact_mut(self.stride).enumerate() {
-            let (above, below) = (&view.row(iy + j)[ix..=ix + self.side], &view.row(iy + j + 1)[ix..=ix + self.side]);
-            let row = &mut row[..self.side];
-            if (fx, fy) == (0.0, 0.0) {
-                row.copy_from_slice(&above[..self.side]);
-                continue;
-            }
+        self.values.resize(side * side, 0.0);
+        for (j, row) in self.values.chunks_exact_mut(side).enumerate() {
+            let (above, below) = (&view.row(iy + j)[ix..=ix + side], &view.row(iy + j + 1)[ix..=ix + side]);
             for (i, value) in row.iter_mut().enumerate() {
                 let top = above[i] + fx * (above[i + 1] - above[i]);
                 let bottom = below[i] + fx * (below[i + 1] - below[i]);
                 *value = top + fy * (bottom - top);
             }
         }
+        (self.side, self.stride) = (side, side.next_multiple_of(LANES) + 2);
+        self.even.resize(side * self.stride, 0.0);
+        self.odd.resize(side * self.stride, 0.0);
+        let parts = self.even.chunks_exact_mut(self.stride).zip(self.odd.chunks_exact_mut(self.stride));
+        let rotated = self.values.chunks_exact(side).rev();
+        for (((even, odd), row), rotated) in parts.zip(self.values.chunks_exact(side)).zip(rotated) {
+            let parts = even.iter_mut().zip(odd.iter_mut());
+            for (((even, odd), a), b) in parts.zip(row).zip(rotated.iter().rev()) {
+                (*even, *odd) = (0.5 * (a + b), 0.5 * (a - b));
+            }
+            even[side..].fill(0.0);
+            odd[side..].fill(0.0);
+        }
         Some(())
     }
 }
 
-/// Refines the corner near `start` with a window radius of `window` pixels (at least 1) and a convergence tolerance in
-/// pixels. `None` if the window extends beyond the image, the corner moves by more than the radius, or there are no two
-/// edge directions.
+/// Returns the distance from a position to the outermost pixel centers of an image, negative outside.
+pub(super) fn border_distance((width, height): (usize, usize), at: Point2<f64>) -> f64 {
+    at.x.min(at.y).min((width as f64 - 1.0) - at.x).min((height as f64 - 1.0) - at.y)
+}
+
+/// Refines the corner near `start` with a window radius of `window` pixels (at least 1), less at the image border, and a
+/// convergence tolerance in pixels. `None` if the corner is within 4 px of the border or moves by more than the window's
+/// radius, or if there are no two edge directions.
 pub(crate) fn refine_saddle(
     view: ImageView<'_, f32, 1>,
     start: Point2<f64>,
     window: f64,
     tolerance: f64,
 ) -> Option<Saddle> {
-    let radius = (1.25 * window.clamp(1.0, 64.0)).round() as usize;
-    let mut patch = Patch { values: Vec::new(), side: 0, stride: 0 };
-    let mut weights = [const { Vec::new() }; 2];
+    let largest = (1.25 * window.clamp(1.0, 64.0)).round() as usize;
+    let (mut patch, mut weights, mut weights_radius) = (Patch::default(), Vec::new(), 0);
     let level = simd::level();
     let mut at = start;
-    let mut center = Point2::new(f64::NAN, f64::NAN);
     for _ in 0..MAX_ITERATIONS {
-        // Sampled at integer pixels: interpolation would smooth asymmetrically, which moves a sharp edge.
-        let is_near = (at.x - center.x).abs().max((at.y - center.y).abs()) < 0.8;
-        if !is_near {
-            center = Point2::new(at.x.round(), at.y.round());
-            patch.sample(view, center, radius + 1)?;
+        // The samples between pixels extend a pixel further, gradients another.
+        let radius = largest.min((border_distance(view.size(), at) - 2.0) as usize);
+        if radius < MIN_RADIUS {
+            return None;
         }
-        let off = at - center;
-        // Biweights along each axis, similar to a Gaussian that is e⁻¹ at the radius, and zero at the window's border.
-        for (weights, off) in weights.iter_mut().zip([off.x, off.y]) {
-            let to = |i: usize| (i as f64 - radius as f64 - off) / (radius + 1) as f64;
-            weights.clear();
-            weights.extend((0..=2 * radius).map(|i| (1.0 - to(i).powi(2)).max(0.0).powi(2) as f32));
-            weights.resize((2 * radius + 1).next_multiple_of(LANES), 0.0);
+        if radius != weights_radius {
+            fill_weights(&mut weights, radius);
+            weights_radius = radius;
         }
+        patch.sample(view, at, radius + 1)?;
         let normal = normal_equations(level, &patch, radius, &weights);
-        let solution = normal.solve()?;
-        let step = [solution[0] - off.x, solution[1] - off.y];
-        at = Point2::new(center.x + solution[0], center.y + solution[1]);
+        let step = -normal.solve()?;
+        if step.norm() < tolerance {
+            return Some(Saddle { position: at + step, deviation: normal.deviation(&patch) });
+        }
+        at += step.cap_magnitude(MAX_STEP);
         let displacement = (at - start).norm();
         if displacement > window.max(1.5) || !displacement.is_finite() {
             return None;
-        }
-        if step[0].hypot(step[1]) < tolerance {
-            patch.sample(view, at, radius + 1)?;
-            return Some(Saddle { position: at, deviation: normal.deviation(&patch) });
         }
     }
     // Not converged: oscillation between nearby positions.
     Some(Saddle { position: at, deviation: 0.5 })
 }
 
-/// Sums of g·gᵀ and of g·gᵀ·x over a window around the center of a patch.
+/// Biweights of the samples along an axis, similar to a Gaussian that is e⁻¹ at 0.8 of the radius, zero after the last one.
+fn fill_weights(weights: &mut Vec<f32>, radius: usize) {
+    let to = |i: usize| (i as f64 - radius as f64) / (radius + 1) as f64;
+    weights.clear();
+    weights.extend((0..=2 * radius).map(|i| (1.0 - to(i).powi(2)).powi(2) as f32));
+    weights.resize((2 * radius + 1).next_multiple_of(LANES), 0.0);
+}
+
+/// Sums of g·gᵀ and of g times the odd part over a window, where g is the gradient of the even part, as a difference over two
+/// pixels.
 struct NormalEquations {
     xx: f64,
     xy: f64,
@@ -131,35 +157,35 @@ struct NormalEquations {
     by: f64,
 }
 
-fn normal_equations(level: Level, patch: &Patch, radius: usize, weights: &[Vec<f32>; 2]) -> NormalEquations {
+fn normal_equations(level: Level, patch: &Patch, radius: usize, weights: &[f32]) -> NormalEquations {
     dispatch!(level, simd => normal_equations_impl(simd, patch, radius, weights))
 }
 
 #[inline(always)]
-fn normal_equations_impl<S: Simd>(simd: S, patch: &Patch, radius: usize, weights: &[Vec<f32>; 2]) -> NormalEquations {
+fn normal_equations_impl<S: Simd>(simd: S, patch: &Patch, radius: usize, weights: &[f32]) -> NormalEquations {
     let (stride, n) = (patch.stride, 2 * radius + 1);
     // The sums of each lane, in an order that does not depend on the machine.
     let mut sums = [[0.0f64; LANES]; 5];
-    let offsets = f32x8::from_slice(simd, &[0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]) - radius as f32;
-    for j in 0..n {
-        let [above, row, below] = [0, 1, 2].map(|k| &patch.values[(j + k) * stride..][..stride]);
-        let y = j as f32 - radius as f32;
+    // The products are even: each row above the middle stands for one below it, too.
+    for j in 0..=radius {
+        let [above, row, below] = [0, 1, 2].map(|k| &patch.even[(j + k) * stride..][..stride]);
+        let odd = &patch.odd[(j + 1) * stride..][..stride];
+        let weight = if j < radius { 2.0 * weights[j] } else { weights[j] };
         let mut row_sums = [f32x8::splat(simd, 0.0); 5];
-        for (start, weights_x) in (0..n).step_by(LANES).zip(weights[0].chunks_exact(LANES)) {
+        for (start, weights_x) in (0..n).step_by(LANES).zip(weights.chunks_exact(LANES)) {
             let gx =
                 f32x8::from_slice(simd, &row[start + 2..][..LANES]) - f32x8::from_slice(simd, &row[start..][..LANES]);
             let gy = f32x8::from_slice(simd, &below[start + 1..][..LANES])
                 - f32x8::from_slice(simd, &above[start + 1..][..LANES]);
+            let odd = f32x8::from_slice(simd, &odd[start + 1..][..LANES]);
             // Zero after the last sample.
-            let w = f32x8::from_slice(simd, weights_x) * weights[1][j];
-            let x = offsets + start as f32;
-            let wx = w * gx;
-            let (xx, xy, yy) = (wx * gx, wx * gy, w * gy * gy);
-            row_sums[0] += xx;
-            row_sums[1] += xy;
-            row_sums[2] += yy;
-            row_sums[3] += xx * x + xy * y;
-            row_sums[4] += xy * x + yy * y;
+            let w = f32x8::from_slice(simd, weights_x) * weight;
+            let (wx, wy) = (w * gx, w * gy);
+            row_sums[0] += wx * gx;
+            row_sums[1] += wx * gy;
+            row_sums[2] += wy * gy;
+            row_sums[3] += wx * odd;
+            row_sums[4] += wy * odd;
         }
         for (sum, row_sum) in sums.iter_mut().zip(&row_sums) {
             let mut lanes = [0.0f32; LANES];
@@ -174,26 +200,22 @@ fn normal_equations_impl<S: Simd>(simd: S, patch: &Patch, radius: usize, weights
 }
 
 impl NormalEquations {
-    /// Solves for the corner relative to the center; `None` if there is only one edge direction.
-    fn solve(&self) -> Option<[f64; 2]> {
+    /// Solves for the position of the window relative to the corner; `None` if there is only one edge direction.
+    fn solve(&self) -> Option<Vector2<f64>> {
         let det = self.xx * self.yy - self.xy * self.xy;
         let trace = self.xx + self.yy;
         // Edges with an angle below about 5° are degenerate.
-        (det > 2e-3 * trace * trace)
-            .then(|| [(self.yy * self.bx - self.xy * self.by) / det, (self.xx * self.by - self.xy * self.bx) / det])
+        (det > 2e-3 * trace * trace).then(|| {
+            // The gradients are twice the derivatives.
+            2.0 / det * Vector2::new(self.yy * self.bx - self.xy * self.by, self.xx * self.by - self.xy * self.bx)
+        })
     }
 
-    /// Estimates the standard deviation of the position. The noise variance σ² is estimated from the difference between
-    /// the window and itself rotated by 180°, under which an X-corner is symmetric; then the Cramér–Rao bound, σ²·(Σ
-    /// g·gᵀ)⁻¹.
+    /// Estimates the standard deviation of the position: the noise variance σ² from the odd part, which has half of it; then
+    /// the Cramér–Rao bound, σ²·(Σ g·gᵀ)⁻¹.
     fn deviation(&self, patch: &Patch) -> f64 {
-        let (side, rows) = (patch.side, patch.values.chunks_exact(patch.stride));
-        // Every difference twice.
-        let difference = |(a, b): (&f32, &f32)| f64::from(a - b).powi(2);
-        let rotated = rows.clone().rev().map(|row| row[..side].iter().rev());
-        let sum: f64 =
-            rows.zip(rotated).map(|(row, other)| row[..side].iter().zip(other).map(difference).sum::<f64>()).sum();
-        let variance = 0.5 * sum / (2.0 * (side * side / 2).max(1) as f64);
+        let sum: f64 = patch.odd.iter().map(|odd| f64::from(*odd).powi(2)).sum();
+        let variance = 2.0 * sum / (patch.side * patch.side) as f64;
         let det = self.xx * self.yy - self.xy * self.xy;
         // Gradients are differences over two pixels, twice the derivative.
         (variance * 4.0 * 0.5 * (self.xx + self.yy) / det).sqrt()
@@ -205,20 +227,44 @@ mod tests {
     use super::*;
     use cv_core::GrayF32;
 
-    #[test]
-    fn the_position_of_a_smooth_x_corner_is_accurate() {
-        // The product of tanh of the distances to two lines: an X-corner with a blur of about 1.5 pixels and an angle
-        // of 60°.
-        let truth = Point2::new(20.3, 18.6);
+    /// The product of tanh of the distances to two lines with an angle of 60°: an X-corner with a blur of about `blur` pixels,
+    /// through a tone curve.
+    fn x_corner(at: Point2<f64>, blur: f64, gamma: f64) -> GrayF32 {
         let side = |x: usize, y: usize, angle: f64| {
             let (sin, cos) = angle.sin_cos();
-            (((y as f64 - truth.y) * cos - (x as f64 - truth.x) * sin) / 1.5).tanh()
+            (((y as f64 - at.y) * cos - (x as f64 - at.x) * sin) / blur).tanh()
         };
-        let image = GrayF32::from_fn(40, 40, |x, y| [(0.5 + 0.4 * side(x, y, 0.2) * side(x, y, 1.25)) as f32]);
+        let level = |x, y| 0.5 + 0.4 * side(x, y, 0.2) * side(x, y, 1.25);
+        GrayF32::from_fn(40, 40, |x, y| [level(x, y).powf(gamma) as f32])
+    }
+
+    #[test]
+    fn neither_wide_blur_nor_a_tone_curve_moves_a_corner() {
+        let truth = Point2::new(20.3, 18.6);
+        for (window, blur) in [(4.0, 4.0), (6.0, 4.0), (8.0, 3.0)] {
+            let image = x_corner(truth, blur, 1.0 / 2.2);
+            let found = refine_saddle(image.view(), Point2::new(21.3, 18.0), window, 1e-4).unwrap();
+            // Interpolation is nearly exact at this blur.
+            assert!((found.position - truth).norm() < 0.003, "{window} {blur}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn corners_near_the_border_are_refined_in_smaller_windows() {
+        // The distance to the lower border: 6.8 px.
+        let truth = Point2::new(20.3, 32.2);
+        let found = refine_saddle(x_corner(truth, 1.5, 1.0).view(), Point2::new(20.0, 33.0), 10.0, 1e-4).unwrap();
+        assert!((found.position - truth).norm() < 0.01, "{found:?}");
+    }
+
+    #[test]
+    fn the_position_of_a_smooth_x_corner_is_accurate() {
+        let truth = Point2::new(20.3, 18.6);
+        let image = x_corner(truth, 1.5, 1.0);
         for start in [Point2::new(20.0, 19.0), Point2::new(21.5, 17.5)] {
             let found = refine_saddle(image.view(), start, 6.0, 1e-4).unwrap();
-            // Sums over pixels approximate integrals well at this blur.
-            assert!((found.position - truth).norm() < 0.002 && found.deviation < 0.02, "{found:?}");
+            // Interpolation between pixels is skewed by up to a hundredth of a pixel at this blur.
+            assert!((found.position - truth).norm() < 0.01 && found.deviation < 0.02, "{found:?}");
         }
         // Straight edges and flat images have no corner, nor do positions outside.
         let edge = GrayF32::from_fn(40, 40, |x, _| [(x > 20) as u8 as f32]);

@@ -81,6 +81,46 @@ fn truncated_boards_are_reported_as_partial() {
     }
 }
 
+/// A chessboard of squares of `side` pixels, whose first inner corner is at `first`; turned by 3°. With 8 × 8 samples per pixel.
+fn drawn_board((width, height): (usize, usize), first: Point2<f64>, side: f64) -> GrayF32 {
+    let (sin, cos) = 3f64.to_radians().sin_cos();
+    let is_black = |x: f64, y: f64| {
+        let (dx, dy) = (x - first.x, y - first.y);
+        let (i, j) = ((dx * cos + dy * sin).div_euclid(side) as i64, (dy * cos - dx * sin).div_euclid(side) as i64);
+        (-1..9).contains(&i) && (-1..6).contains(&j) && (i + j) % 2 == 0
+    };
+    let offset = |k: usize| (k as f64 + 0.5) / 8.0 - 0.5;
+    GrayF32::from_fn(width, height, |x, y| {
+        let black = (0..64).filter(|k| is_black(x as f64 + offset(k / 8), y as f64 + offset(k % 8))).count();
+        [0.9 - 0.8 * black as f32 / 64.0]
+    })
+}
+
+#[test]
+fn boards_are_detected_up_to_the_image_border() {
+    // All inner corners are in the image; of the outer squares, those of the first row and column are cut off. A corner that is
+    // less than 4 px from the border is not localized.
+    let side = 40.0;
+    let (sin, cos) = 3f64.to_radians().sin_cos();
+    for near in [6.0, 9.0, 14.0] {
+        let first = Point2::new(near + 5.0 * side * sin, near);
+        let gray = drawn_board((400, 280), first, side);
+        let board = find(&gray, Some(SIZE)).unwrap_or_else(|error| panic!("{near}: {error}"));
+        let mut errors: Vec<f64> = (0..54)
+            .map(|k| {
+                let (i, j) = ((k % 9) as f64 * side, (k / 9) as f64 * side);
+                let truth = Point2::new(first.x + i * cos - j * sin, first.y + i * sin + j * cos);
+                board.corners.iter().map(|c| (c - truth).norm()).fold(f64::INFINITY, f64::min)
+            })
+            .collect();
+        errors.sort_by(f64::total_cmp);
+        // The aliasing of unblurred edges; more in the small windows at the border.
+        assert!(errors[27] < 0.02 && errors[53] < 0.1, "{near}: {} {}", errors[27], errors[53]);
+    }
+    let cut_off = find(&drawn_board((400, 280), Point2::new(2.0 + 5.0 * side * sin, 2.0), side), Some(SIZE));
+    assert!(matches!(cut_off, Err(BoardError::Partial { found: 40..54, cut_off: true, .. })), "{cut_off:?}");
+}
+
 #[test]
 fn several_boards_are_reported() {
     // Two boards of 10×7 squares of 20 px, with white margins of 40 px.
@@ -91,6 +131,12 @@ fn several_boards_are_reported() {
     });
     assert_eq!(find(&image, Some(SIZE)), Err(BoardError::SeveralBoards { boards: 2 }));
     assert_eq!(find(&image, None).map(|board| board.size), Ok(SIZE));
+    // The picture of the board on a screen beside it has a quarter of its extent.
+    let large = drawn_board((520, 340), Point2::new(150.0, 60.0), 40.0);
+    let small = drawn_board((520, 340), Point2::new(15.0, 60.0), 10.0);
+    let image = GrayF32::from_fn(520, 340, |x, y| if x < 100 { small.at(x, y) } else { large.at(x, y) });
+    let found = find(&image, Some(SIZE)).unwrap();
+    assert!(found == find(&large, Some(SIZE)).unwrap() && find(&small, Some(SIZE)).is_ok());
 }
 
 #[test]
