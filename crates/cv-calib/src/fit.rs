@@ -8,8 +8,9 @@ use cv_numeric::RobustLoss;
 
 /// Median of the Rayleigh distribution: the median length of a vector of two standard normal coordinates.
 const RAYLEIGH_MEDIAN: f64 = 1.1774;
-/// Lower bound of the noise standard deviation, in pixels: below it, residuals are rounding errors.
-const MIN_SIGMA_PX: f64 = 1e-4;
+/// Lower bound of the noise standard deviation for robust losses and outliers, in pixels. Aliasing moves all corners on edges
+/// that are parallel to pixel rows by up to 0.1 px: no reason to reject a photograph among others that fit to 0.01 px.
+const MIN_SIGMA_PX: f64 = 0.04;
 /// Maximum number of rounds of outlier rejection.
 const REJECTION_ROUNDS: usize = 5;
 /// Number of views, evenly sampled, of the first robust fit; from its result, all views need few iterations.

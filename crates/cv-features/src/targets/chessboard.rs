@@ -82,7 +82,8 @@ impl Chessboard {
 /// Detects the chessboard of `size` inner corners, or with `None` the largest one of any size.
 ///
 /// `view` is gray, 0 to 1. Without a size, the visible part of a truncated board counts as a board: use the most
-/// frequent size of several images. A second board of less than a third of the first one's extent is ignored. A board of 9×6 is also detected as 6×9, with rows and columns exchanged.
+/// frequent size of several images. A second board of less than a third of the first one's extent is ignored. A board of
+/// 9×6 is also detected as 6×9, with rows and columns exchanged.
 ///
 /// # Errors
 /// [`BoardError`].
