@@ -13,11 +13,11 @@ use cv_core::{Cancelled, Distortion, DistortionModel, LensProjection, Point2, Pr
 pub enum LensVerdict {
     /// The only model that was requested.
     Asked,
-    /// Selected: the smallest hold-out error, or one that is not significantly larger with fewer parameters.
+    /// Selected: the fewest parameters among the models whose hold-out error is not significantly larger than the smallest.
     Chosen,
     /// Its hold-out error is significantly larger.
     LessExact,
-    /// Its hold-out error is not significantly different, with more parameters.
+    /// Its hold-out error is not significantly different, with at least as many parameters.
     NotNeeded,
     /// Its distortion is not monotonic within the image.
     Folds,
@@ -84,31 +84,29 @@ pub(crate) fn rms(data: &TargetObservations, fit: &Fit, camera: Option<usize>) -
 /// Maximum fraction of the corners beyond the monotonic range of the distortion that are rejected as outliers.
 const MAX_BEYOND_RANGE: f64 = 0.01;
 
-/// Fits a model as [`fit`]. Inlier corners beyond the monotonic range of the distortion are rejected, once: numerator and
-/// denominator of a rational model may have almost the same root, just at the outermost corner. `None` if the distortion is
-/// not monotonic up to the outermost inlier corner.
+/// Fits a model as [`fit`]; also returns whether the distortion is monotonic up to the outermost inlier corner. A few corners
+/// beyond its monotonic range are rejected, once: numerator and denominator of a rational model may have almost the same root,
+/// just at the outermost corner.
 fn fit_monotonic(
     data: &TargetObservations,
     start: &Estimate,
     corners: &InlierMask,
     limits: Limits,
     progress: &dyn Progress,
-) -> Result<Option<Fit>, Failure> {
-    let mut usable = corners.clone();
-    let first = fit(data, start, &usable, limits, progress)?;
+) -> Result<(Fit, bool), Failure> {
+    let first = fit(data, start, corners, limits, progress)?;
     let beyond = corners_beyond_range(data, &first);
-    if beyond.is_empty() {
-        return Ok(Some(first));
-    }
     let inliers = first.used.iter().flatten().flatten().filter(|used| **used).count();
-    if beyond.len() as f64 > MAX_BEYOND_RANGE * inliers as f64 {
-        return Ok(None);
+    if beyond.is_empty() || beyond.len() as f64 > MAX_BEYOND_RANGE * inliers as f64 {
+        return Ok((first, beyond.is_empty()));
     }
+    let mut usable = corners.clone();
     for (v, i) in beyond {
         usable[v][0][i] = false;
     }
     let second = fit(data, start, &usable, limits, progress)?;
-    Ok(corners_beyond_range(data, &second).is_empty().then_some(second))
+    let is_monotonic = corners_beyond_range(data, &second).is_empty();
+    Ok((second, is_monotonic))
 }
 
 /// Returns the inlier corners at which the distortion is not monotonic: view, index.
@@ -213,12 +211,7 @@ pub(crate) fn choose_lens(
         };
         let fitted = match starts.with_model(model, &stage) {
             Ok(start) => match fit_monotonic(data, &start.estimate, &corners, limits, &stage) {
-                Ok(Some(fitted)) => Some(fitted),
-                Ok(None) => {
-                    trials.push(LensTrial { verdict: LensVerdict::Folds, ..no_fit });
-                    stage.add(1)?;
-                    continue;
-                }
+                Ok(fitted) => Some(fitted),
                 Err(Failure::Cancelled) => return Err(Cancelled.into()),
                 Err(Failure::Adjust(_)) => None,
             },
@@ -231,14 +224,15 @@ pub(crate) fn choose_lens(
             Err(error) => return Err(error),
         };
         stage.add(1)?;
-        let Some(fitted) = fitted else {
+        let Some((fitted, is_monotonic)) = fitted else {
             trials.push(no_fit);
             continue;
         };
         let (rms_px, count) = rms(data, &fitted, None);
         let outliers = corners.iter().flatten().flatten().filter(|u| **u).count() - count;
-        trials.push(LensTrial { rms_px, outliers, verdict: LensVerdict::Asked, ..no_fit });
-        if count > 0 {
+        let verdict = if is_monotonic { LensVerdict::Asked } else { LensVerdict::Folds };
+        trials.push(LensTrial { rms_px, outliers, verdict, ..no_fit });
+        if is_monotonic && count > 0 {
             fits.push((trials.len() - 1, fitted));
         }
     }

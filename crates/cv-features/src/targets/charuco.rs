@@ -7,7 +7,7 @@
 use super::BoardError;
 use super::board::{BoardPoint, CharucoBoard};
 use super::chessboard::ChessboardOptions;
-use super::grid::{Grid, assemble_grids};
+use super::grid::{Grid, SAME_CORNER, assemble_grids};
 use super::marker::{MarkerShape, diagnose, sample_bits, unit_square_to_image};
 use super::saddle::refine_saddle;
 use super::x_corner::detect_x_corners;
@@ -95,7 +95,7 @@ pub fn find_charuco(
     // Parts of one board separated by an occluder have different corners, or the same ones at the same positions.
     let is_elsewhere = |p: &BoardPoint| {
         let known = best.binary_search_by_key(&p.id, |q| q.id).ok().map(|i| best[i].position);
-        known.is_some_and(|q| (q - p.position).norm() > 3.0)
+        known.is_some_and(|q| (q - p.position).norm() > SAME_CORNER)
     };
     let is_other_board = |points: &&Vec<BoardPoint>| points.iter().filter(|p| is_elsewhere(p)).count() >= 4;
     let several = boards.iter().filter(is_other_board).count();

@@ -2,7 +2,7 @@
 
 use super::board::{BoardPoint, BoardSize};
 use super::board_error::BoardError;
-use super::grid::{Grid, Node, assemble_grids};
+use super::grid::{Grid, Node, SAME_CORNER, assemble_grids};
 use super::saddle::refine_saddle;
 use super::x_corner::detect_x_corners;
 use crate::error::check_image;
@@ -12,9 +12,6 @@ use cv_parallel::prelude::*;
 /// Window radius of the corner refinement relative to the distance to the nearest neighbor: small enough to exclude the
 /// neighbor's edges.
 const WINDOW_RATIO: f64 = 0.3;
-
-/// Maximum distance in pixels of two detections of one corner.
-const SAME_CORNER: f64 = 3.0;
 
 /// Minimum extent in the image of another board, relative to that of the largest. A smaller one is its picture on the screen
 /// of the computer that records the photographs.

@@ -19,6 +19,9 @@ const MAX_CANDIDATES: usize = 80;
 /// Convergence tolerance of corner positions during grid growth, in pixels.
 const COARSE_TOLERANCE: f64 = 0.1;
 
+/// Maximum distance in pixels of two detections of one corner.
+pub(crate) const SAME_CORNER: f64 = 3.0;
+
 /// A node of a grid.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Node {
